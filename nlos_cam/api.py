@@ -73,6 +73,10 @@ class Stream:
         return sum(self._statistics.lost(self.camera, self._reader).values())
 
     def __enter__(self) -> Self:
+        if self._reader is not None:
+            raise NlosCamError(
+                "this stream was started before: start another by `nlos_cam.open(...)`"
+            )
         with ExitStack() as entered:  # leaves the camera if a later step fails
             camera = entered.enter_context(self.camera)
             frames, telemetry = with_telemetry(camera)

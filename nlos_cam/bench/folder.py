@@ -177,7 +177,8 @@ def _check_file(folder: Path, record: BenchRecord, name: str) -> None:
     if found != record.files[name]:
         raise RecordFileError(
             f"{path} has changed since the bench was written (its checksum differs from"
-            f" {MANIFEST}): put the original back, or {again} the bench again"
+            f" {MANIFEST}): put the original back, or {again} the bench again; by hand you may edit"
+            f" the object box in {MANIFEST} alone"
         )
 
 

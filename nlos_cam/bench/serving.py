@@ -8,7 +8,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 from nlos_calibration import Rig
-from nlos_models import CheckpointRecord, Reconstructor, UncertaintyModel
+from nlos_models import (
+    SHIPPED,
+    CheckpointRecord,
+    Reconstructor,
+    UncertaintyModel,
+    checksum_of_watched,
+    load_record,
+    shipped_folder,
+    weights_folder,
+)
 
 from nlos_cam import reconstruct
 from nlos_cam.bench.edit import TEST_IOU
@@ -25,6 +34,8 @@ class ServingNetworks(NamedTuple):
     verdict: WeightsVerdict
     mismatches: tuple[str, ...]
     """Sentences on what the bench and the weights disagree in: expect larger errors."""
+    weights: str
+    """Name of shipped weights, else their folder, with the checksum of the networks."""
 
 
 def load_serving(
@@ -39,25 +50,48 @@ def load_serving(
     folder = weights or reconstruct.weights_for(calibrated.rig)
     network = reconstruct.load_networks(folder)
     uncertainty_model = reconstruct.load_uncertainty(folder)
-    verdict = weights_verdict(calibrated.rig, network.record, bench, record)
+    verdict = weights_verdict(calibrated.rig, folder, bench, record, trained=network.record)
     mismatches = reconstruct.compatibility_warnings(
         calibrated, network.record, uncertainty_model, verdict
     )
-    return ServingNetworks(network, uncertainty_model, verdict, tuple(mismatches))
+    return ServingNetworks(
+        network, uncertainty_model, verdict, tuple(mismatches), _weights_in_words(folder)
+    )
+
+
+def _weights_in_words(weights: Path) -> str:
+    """Return what a reader needs to find weights again, such as "direct 89ce399040ef"."""
+    folder = weights_folder(weights)
+    shipped = [name for name in SHIPPED if shipped_folder(name) == folder]
+    return f"{shipped[0] if shipped else folder} {checksum_of_watched(folder)}"
 
 
 def weights_verdict(
-    rig: Rig, trained: CheckpointRecord, bench: Bench | None, record: Path | None = None
+    rig: Rig,
+    weights: Path,
+    bench: Bench | None,
+    record: Path | None = None,
+    *,
+    trained: CheckpointRecord | None = None,
 ) -> WeightsVerdict:
-    """Return whether weights serve a rig, for the user, with the bench folder to train others in
-    (or the wall record, where there is none) and what to expect of them.
+    """Return whether a folder of weights serves a rig, for the user, with the bench folder to train
+    others in (or the wall record, where there is none) and what to expect of both.
+
+    `trained` is the weights' record, where it was read before. Raises CheckpointError.
     """
+    trained = trained or load_record(weights)
     if bench is None:
         place = shlex.quote(str(record or "bench/"))
         return weights_serve(rig, trained, bench=place)
     folder = shlex.quote(str(bench.folder))
     expected_iou = bench.expected_iou
-    served = weights_serve(rig, trained, expected_iou=expected_iou, bench=folder)
+    served = weights_serve(
+        rig,
+        trained,
+        expected_iou=expected_iou,
+        present_iou=reconstruct.shipped_iou(rig, weights),
+        bench=folder,
+    )
     if bench.has_old_forecast:
         old = (
             f"{served.sentence} (the forecast is of another object box or an earlier version:"

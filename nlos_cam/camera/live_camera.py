@@ -228,6 +228,8 @@ class LiveCamera:
                 self._recovery = None
                 frame = session.frame(found, self._truth_depth_m(found.number))
                 frame = self._continuity.add(frame, self._clock.now())
+                if self._recording:
+                    self._recording.added_s = self._continuity.added_s
                 self._count(session.inbox)
                 yield frame
             elif session.inbox.ended:
@@ -280,6 +282,7 @@ class LiveCamera:
                 self._recording.close()
             # Before it begins: the SDK's thread must pass it a set, as a boundary.
             self._recording = recording
+            recording.added_s = self._continuity.added_s
             try:
                 recording.join(self._device, self._sdk)
             except BaseException:

@@ -353,6 +353,8 @@ class Recording:
         """Which of these it was."""
         self.error: DiskFullError | None = None
         """Reason for which this take's file has no index."""
+        self.added_s = 0.0
+        """What the camera adds to the device's timestamps in the frames that it yields."""
         self._frames = frames
         self._seconds = seconds
         self._last = last
@@ -529,7 +531,10 @@ class Recording:
         """Return True if a frame is in this take: those yielded now may have queued since before
         it.
         """
-        return self._before_s < timestamp_s and (not self.done or timestamp_s <= self._last_s)
+        device_s = timestamp_s - self.added_s
+        # a sum and a difference of two fractions are not exact
+        is_after = device_s > self._before_s + SAME_INSTANT_S
+        return is_after and (not self.done or device_s < self._last_s + SAME_INSTANT_S)
 
     def stop(self) -> None:
         """Stop after the set in flight; the device still runs."""

@@ -80,8 +80,7 @@ def open_camera(
 def full_uri(uri: str | Path) -> str:
     """Return a camera's name; that of a recording, run.bag or sample, is bag:run.bag, bag:sample."""
     uri = str(uri)
-    # a session of `detect`, a folder, may be called so
-    if uri == PACKAGED_RECORDING and not Path(uri).is_dir():
+    if uri == PACKAGED_RECORDING:
         return f"bag:{uri}"
     is_path = uri.endswith((".bag", ".db3", ".mcap")) or (Path(uri) / "metadata.yaml").is_file()
     return f"bag:{uri}" if is_path and not uri.startswith(("bag:", "sim:", "l515:")) else uri

@@ -55,8 +55,9 @@ class Continuity:
 
     def __init__(self) -> None:
         self.missed = 0
+        self.added_s = 0.0
+        """What is added to the device's timestamps now."""
         self._add_number = 0
-        self._add_s = 0.0
         self._last: Frame | None = None
         self._last_arrived_s = 0.0
         self._restarted = False
@@ -76,9 +77,9 @@ class Continuity:
             self._splice(last, frame, arrived_s)  # also where the device restarts its count alone
         self._restarted = False
         self._counted = 0
-        if self._add_number or self._add_s:
+        if self._add_number or self.added_s:
             number = frame.frame_number + self._add_number
-            timestamp_s = frame.timestamp_s + self._add_s
+            timestamp_s = frame.timestamp_s + self.added_s
             frame = replace(frame, frame_number=number, timestamp_s=timestamp_s)
         self._last = frame
         self._last_arrived_s = arrived_s
@@ -90,9 +91,9 @@ class Continuity:
         # that was reset falls back, or differs from the host's by more than a delivery can be late.
         # Then the host's replaces it.
         host_s = max(FRAME_PERIOD_S, arrived_s - self._last_arrived_s)
-        device_s = frame.timestamp_s + self._add_s - last.timestamp_s
+        device_s = frame.timestamp_s + self.added_s - last.timestamp_s
         if device_s < FRAME_PERIOD_S / 2 or abs(device_s - host_s) > SAME_CLOCK_S:
-            self._add_s += host_s - device_s
+            self.added_s += host_s - device_s
             device_s = host_s
         # The frame stands n >= 1 periods after the last one; of the n - 1 numbers in between, those
         # that the last session counted as incomplete or dropped are not counted again.

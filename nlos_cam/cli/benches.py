@@ -18,8 +18,6 @@ from nlos_cam.cli import common
 from nlos_cam.errors import OutputExistsError
 
 if TYPE_CHECKING:
-    import nlos_models as models
-
     from nlos_cam.forecast import Forecast
 
 BenchFolder = Annotated[
@@ -77,21 +75,19 @@ class Choice(NamedTuple):
         rig, file = recordings.load_measured_wall(self.record)
         return (self.bench.rig if self.bench else rig), file
 
-    def load_networks(
-        self, bench: reconstruct.CalibratedRig
-    ) -> tuple[models.Reconstructor, models.UncertaintyModel | None]:
-        """Load the weights, or the shipped ones that serve a rig best, and print the model's name
-        and its mismatches with the bench. Raises CheckpointError.
+    def load_networks(self, bench: reconstruct.CalibratedRig) -> benches.ServingNetworks:
+        """Load the weights, or the shipped ones that serve a rig best, and print their name and
+        their mismatches with the bench. Raises CheckpointError.
         """
         found = benches.load_serving(bench, self.weights, self.bench, self.record)
-        name = reconstruct.rig_in_words(found.network.record)
-        common.say(f"Loaded model {name} ({found.network.runtime})")
+        rig = reconstruct.rig_in_words(found.network.record)
+        common.say(f"Loaded weights {found.weights}, for {rig} ({found.network.runtime})")
         if not found.verdict.is_warning:
             sentence = found.verdict.sentence
             common.say(sentence[:1].upper() + sentence[1:])
         for mismatch in found.mismatches:
             common.say(f"note: {mismatch}")
-        return found.network, found.uncertainty_model
+        return found
 
 
 def choose(

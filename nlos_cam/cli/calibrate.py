@@ -12,7 +12,6 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import nlos_calibration as walls
-import nlos_models as models
 import typer
 from nlos_calibration.errors import CalibrationError, RecordFileError
 from rich.live import Live
@@ -68,7 +67,7 @@ def format_result(record: walls.WallRecord, files: bench.WallFiles) -> str:
     written = [str(files.record), files.report.name]
     if record.reference:
         written.insert(1, files.reference.name)
-    report = escape(files.report.name)
+    report = escape(str(files.report))
     lines.append(f"Wrote {escape(', '.join(written))}: open {report} for the report")
     return "\n".join(lines)
 
@@ -316,8 +315,7 @@ def _report(target: Target, record: walls.WallRecord, *, as_json: bool) -> None:
     loaded = _written_bench(target.folder) if target.folder else None
     rig = loaded.rig if loaded else record.beam_rig
     own = loaded.weights if loaded else None
-    trained = models.load_record(own or reconstruct.weights_for(rig))
-    served = benches.weights_verdict(rig, trained, loaded, files.record)
+    served = benches.weights_verdict(rig, own or reconstruct.weights_for(rig), loaded, files.record)
     result["weights"] = {
         "serve": served.serve,
         "verdict": served.sentence,
@@ -461,7 +459,7 @@ def _next_step(folder: Path, record: walls.WallRecord, served: reconstruct.Weigh
         return step
     # An adaptation from before is to the rig that was just replaced.
     again = " --overwrite" if (folder / WORK / adaptation.PLAN).exists() else ""
-    if served.serve:
+    if served.serve or not served.adapting_helps:
         return pictures
     return f"nlos-cam adapt {name} --minutes 10{again}, then {pictures}"
 

@@ -123,14 +123,22 @@ def format_take(take: recordings.CaptureResult) -> str:
     )
 
 
-MAX_S = 1e9
-"""Longer than any disk lasts; infinity cannot be converted to a number of frames."""
+def format_takes(
+    results: Sequence[recordings.CaptureResult], targets: Sequence[recordings.CaptureTarget]
+) -> str:
+    """Return the lines that report the whole capture: a single take, or the sum of several."""
+    if len(targets) == 1:
+        return format_take(results[0])
+    frames = sum(take.summary.frames or 0 for take in results)
+    return f"Recorded {len(results)} of {len(targets)} takes, {frames} frames in all"
+
+
 Seconds = Annotated[
     float | None,
     typer.Option(
         "--seconds",
         min=0.03,
-        max=MAX_S,
+        max=common.MAX_S,
         help="Stop after this many seconds (default: run until Ctrl-C).",
     ),
 ]
@@ -143,7 +151,7 @@ Pause = Annotated[
     typer.Option(
         "--pause-s",
         min=0.0,
-        max=MAX_S,
+        max=common.MAX_S,
         help="With --takes, seconds between them (default: wait for Enter, at a terminal).",
     ),
 ]
@@ -209,7 +217,7 @@ def capture(
     common.finish(
         result_of(results, several=takes > 1),
         as_json=json,
-        text="\n".join(map(format_take, results)),
+        text=format_takes(results, targets),
     )
     if error := final_error(results[-1]):
         common.say(f"[bold red]error:[/] {escape(str(error))}", marked=True)
@@ -287,6 +295,8 @@ def _record(
             for take in recorded:
                 result = recordings.finalize(take, partial(_verify, bar, take.sets))
                 results.append(result)
+                if len(session.targets) > 1:
+                    common.say(format_take(result))
                 if dropped := result.summary.dropped:
                     common.say(
                         f"[yellow]Warning:[/] {dropped} frames were dropped; the recording has"
@@ -297,7 +307,7 @@ def _record(
                     break
                 if left := len(session.targets) - len(results):
                     takes = "1 take" if left == 1 else f"{left} takes"
-                    _pause(bar, stop, pause_s, f"{format_take(result)}\n{takes} left")
+                    _pause(bar, stop, pause_s, f"{takes} left")
                     bar.reset(task)
                 if stop.is_set():
                     break

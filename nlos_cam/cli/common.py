@@ -53,6 +53,10 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, SIGTERM or SIGHUP."""
 LINE_PERIOD_S = 10.0
 """Seconds between two lines of progress where stderr is no terminal."""
+MAX_S = 1e9
+"""Longest time that an option takes: longer than any disk lasts, and infinity is no time to wait
+for, nor a number of frames.
+"""
 NARROW_COLUMNS = 60
 NOTICES = "nlos_cam.kernel_cache"
 """Logger of what every user is told, not with --verbose alone: that kernels are compiled."""

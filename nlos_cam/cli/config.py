@@ -23,6 +23,10 @@ from nlos_cam.files import read_toml
 
 FILE = "nlos-cam.toml"
 MAX_PORT = 65535
+SAMPLE = "sample"
+"""Name of the recording in the package."""
+ROS2_RECORD = "metadata.yaml"
+"""File in the folder of a bag of ROS 2."""
 
 
 class Setting(NamedTuple):
@@ -127,12 +131,17 @@ def _checked(path: Path, name: str, value: object) -> str | int:
     if not isinstance(value, str) or not value:
         raise RecordingError(f"{path}: {name} must be a text in quotes (got {value!r:.40})")
     scheme, colon, rest = value.rpartition(":") if name == "camera" else ("", "", value)
-    is_path = name != "camera" or rest.endswith((".toml", ".bag"))
+    is_path = name != "camera" or _is_file_of_camera(path.parent / rest)
     if name == "weights":
         from nlos_models import SHIPPED  # not for the help page
 
         is_path = value not in SHIPPED or (path.parent / value).exists()
     return f"{scheme}{colon}{path.parent / Path(rest).expanduser()}" if is_path else value
+
+
+def _is_file_of_camera(path: Path) -> bool:
+    """Return True for a scene, a recording, or the folder of one of ROS 2."""
+    return path.suffix in {".toml", ".bag", ".db3", ".mcap"} or (path / ROS2_RECORD).is_file()
 
 
 Verbose = Annotated[
@@ -172,7 +181,9 @@ def shared_options(name: str, command: Callable[..., None]) -> Callable[..., Non
         set_detail(verbose=verbose, quiet=quiet)
         settings = read_settings()
         used = {key: value for key, value in settings.items() if name in SETTINGS[key].commands}
-        named = _choose_camera(values, used) if takes_camera else True
+        named = (
+            _choose_camera(values, used, may_be_folder=name == "detect") if takes_camera else True
+        )
         _choose_bench(values, used)
         _fill(values, used)
         if not named:
@@ -208,10 +219,11 @@ def _optional(annotation: Any) -> Any:
     return Annotated[annotation.__origin__ | None, *annotation.__metadata__]
 
 
-def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> bool:
+def _choose_camera(values: dict[str, Any], used: dict[str, Value], *, may_be_folder: bool) -> bool:
     """Enter the camera of the argument, the option or the setting; another than the setting's has
-    another wall. A bench folder as the argument, beside the option, is --bench. Return whether
-    anything named a camera, or a recording in place of one.
+    another wall. A bench folder as the argument, beside the option, is --bench. Where it
+    `may_be_folder`, a folder stands for the session in it. Return whether anything named a camera,
+    or a recording in place of one.
     """
     argument = values.pop("camera")
     option = values.pop("camera_option")
@@ -231,10 +243,11 @@ def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> bool:
     values["camera"] = (
         used["camera"].value if given is None and values.get("bag") is None else given
     )
-    if values["camera"] is not None:
+    camera = values["camera"]
+    if camera is not None and not (may_be_folder and Path(str(camera)).is_dir()):
         from nlos_cam.camera import full_uri
 
-        values["camera"] = full_uri(str(values["camera"]))
+        values["camera"] = full_uri(str(camera))
     is_default = given is None and used["camera"].source == DEFAULT
     return not is_default or values.get("bag") is not None
 
@@ -247,12 +260,6 @@ def _drop_bench(values: Mapping[str, Any], used: dict[str, Value], given: str) -
     for key in ("wall", "bench"):
         if key in used and (left := used.pop(key)).value is not None and not is_named:
             say(f"note: {key} = {left.value} (from {left.source}) is not used with {given}")
-
-
-SAMPLE = "sample"
-"""Name of the recording in the package."""
-ROS2_RECORD = "metadata.yaml"
-"""File in the folder of a bag of ROS 2."""
 
 
 def _take_default_camera(values: dict[str, Any]) -> None:
@@ -362,7 +369,7 @@ def _is_result(given: object) -> bool:
 
 def _is_packaged(given: object) -> bool:
     """Return True for the recording of the package, which is of no bench that a user has."""
-    return str(given) == SAMPLE and not Path(SAMPLE).is_file()
+    return str(given).removeprefix("bag:") == SAMPLE and not Path(SAMPLE).is_file()
 
 
 def _choose_bench(values: Mapping[str, Any], used: dict[str, Value]) -> None:
@@ -374,7 +381,7 @@ def _choose_bench(values: Mapping[str, Any], used: dict[str, Value]) -> None:
     if any(_is_result(values.get(name)) for name in ("file", "camera")):
         for name in ("bench", "wall", "weights"):
             used.pop(name, None)
-    if any(_is_packaged(values.get(name)) for name in ("file", "bag")):
+    if any(_is_packaged(values.get(name)) for name in ("file", "bag", "camera")):
         _drop_bench(values, used, SAMPLE)
     if any(values.get(name) is not None for name in ("wall", "data")) or _names_rig(values):
         used.pop("bench", None)

@@ -160,7 +160,7 @@ def live(
                 control=control,
             )
 
-    if log:
+    if log and report.frames:
         common.say(f"Logged each frame to {log}")
     if recording:
         recorded = f"{recording.sets} frames to {recording.path}" if recording.sets else "no frame"
@@ -260,9 +260,14 @@ def _load_pipeline(
     checks: reconstruct.PhysicsCheck,
 ) -> reconstruct.Pipeline:
     """Load the networks that serve a bench and build their pipeline."""
-    network, uncertainty_model = chosen.load_networks(bench)
+    found = chosen.load_networks(bench)
     return reconstruct.build_pipeline(
-        bench, network, average, uncertainty_model=uncertainty_model, checks=checks
+        bench,
+        found.network,
+        average,
+        uncertainty_model=found.uncertainty_model,
+        checks=checks,
+        weights=found.weights,
     )
 
 

@@ -4,6 +4,7 @@ surfaces as files.
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -218,7 +219,8 @@ def _export_objects(
         )
     if result.suffix == ".bag":
         raise typer.BadParameter(
-            f"--object needs a replay's result: nlos-cam replay {result} --object ply,glb,csv"
+            "--object needs a replay's result: nlos-cam replay"
+            f" {shlex.quote(str(result))} --object ply,glb,csv"
         )
     with common.stop_on_signals() as stop, common.tracked("exporting") as on_frame:
         count = replays.export_objects(result, folder, formats, every, stop=stop, on_frame=on_frame)

@@ -24,6 +24,7 @@ from nlos_cam import replay as replays
 from nlos_cam import view as views
 from nlos_cam.cli import benches
 from nlos_cam.cli.common import (
+    MAX_S,
     Json,
     exit_interrupted,
     finish,
@@ -137,7 +138,19 @@ Wall = Annotated[
 Seconds = Annotated[
     float | None,
     typer.Option(
-        "--seconds", min=0.1, help="Stop after this many seconds (default: run until Ctrl-C)."
+        "--seconds",
+        min=0.1,
+        max=MAX_S,
+        help="Stop after this many seconds (default: run until Ctrl-C).",
+    ),
+]
+ViewSeconds = Annotated[
+    float | None,
+    typer.Option(
+        "--seconds",
+        min=0.1,
+        max=MAX_S,
+        help="Stop this many seconds after every frame is there (default: run until Ctrl-C).",
     ),
 ]
 
@@ -147,7 +160,7 @@ def view(
     wall: Wall = None,
     bench_folder: benches.BenchOrWeights = None,
     weights: benches.Weights = None,
-    seconds: Seconds = None,
+    seconds: ViewSeconds = None,
     view_port: ViewPort = None,
     view_host: ViewHost = None,
     open_view: Open = False,
@@ -174,7 +187,8 @@ def view(
         with interrupted_by_signals():
             opened = cameras.open_camera(f"bag:{file}")
             bench = chosen.open(opened)
-            networks = chosen.load_networks(bench)
+            found = chosen.load_networks(bench)
+            networks = found.network, found.uncertainty_model
             playback = replays.Playback(opened, bench, networks, host=host, port=view_port)
         with stop_on_signals() as stop, playback:
             announce(playback, what="recording")
@@ -215,5 +229,5 @@ def saving(
             say(f"[yellow]warning:[/] {escape(session.problem)}", marked=True)
         elif session.left_out:
             say(f"note: {path} lacks {session.left_out} moments for which there was no time")
-    if not session.problem:
+    if session.kept and not session.problem:
         say(f"Saved the view: open {path} in a browser")

@@ -1,6 +1,7 @@
 """Page of a detection, to publish: verdict, power, significance maps, settings, turns."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 
@@ -86,8 +87,16 @@ PROTOCOL = (
 )
 
 
+SIMULATED = " On the simulated camera: this says nothing about a real L515."
+
+
 def verdict(analysis: Analysis) -> Banner:
-    """Return the verdict, and what it rests on."""
+    """Return the verdict, what it rests on, and that the camera was simulated where it was."""
+    found = _verdict(analysis)
+    return replace(found, advice=found.advice + SIMULATED * analysis.plan.is_simulated)
+
+
+def _verdict(analysis: Analysis) -> Banner:
     plan = analysis.plan
     if not analysis.complete:
         return Banner(

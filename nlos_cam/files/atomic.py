@@ -75,7 +75,7 @@ def atomic_directory(out: Path, *, drop: Collection[str] = ()) -> Generator[Path
     """Yield an empty directory; on success flush it to disk and let it take the place of `out` in
     one rename.
 
-    Entries of `out` with other names stay, but for files that match a pattern of `drop`, as in
+    `out` keeps its owner and permissions. Entries of it with other names stay, but for files that match a pattern of `drop`, as in
     `fnmatch`, and folders that match one with a slash at its end: they go in the same step, or
     after the new entries where there is no such step.
     Raises OutputExistsError where `out` is a file, or appeared meanwhile, and FileBusyError while
@@ -145,8 +145,10 @@ def _replace_directory(part: Path, out: Path, folder: Path, drop: Collection[str
     others = [entry for entry in others if entry not in dropped]
 
     fixed = Path.cwd().is_relative_to(out) or any(entry.is_mount() for entry in (out, *others))
-    if not fixed and _link_all(others, part) and _exchange(part, out):
-        return
+    if not fixed and _link_all(others, part):
+        _keep_access(out, part)
+        if _exchange(part, out):
+            return
 
     # Entry by entry where the directory itself has to stay, or the system cannot exchange two.
     for name in replaced:
@@ -158,6 +160,17 @@ def _replace_directory(part: Path, out: Path, folder: Path, drop: Collection[str
             shutil.rmtree(entry)
         else:
             entry.unlink()
+
+
+def _keep_access(old: Path, new: Path) -> None:
+    """Give a folder the owner, group and permissions of the one that it replaces, as far as this
+    user may.
+    """
+    status = old.stat()
+    with suppress(OSError, AttributeError):  # Windows has no owners
+        os.chown(new, status.st_uid, status.st_gid)
+    with suppress(OSError):
+        shutil.copymode(old, new)  # after the owner: a change of owner clears the bit for the group
 
 
 def _link_all(entries: list[Path], target: Path) -> bool:

@@ -28,14 +28,16 @@ FILES: dict[str, tuple[str, Describe]] = {
     ".obj": ("mesh", files.describe_mesh),
     ".ply": ("mesh", files.describe_mesh),
     ".stl": ("mesh", files.describe_mesh),
+    ".csv": ("log", files.describe_log),
+    ".jsonl": ("log", files.describe_log),
 }
 """Word for a damaged file, and reader, by suffix."""
 KINDS = (
     "recordings (.bag) and their sidecars (.json), .npz files, saved views and reports (.html),"
     " wall, scene, rig and recipe files (.toml), dataset shards (.h5), transients (.hdf5), meshes"
-    " and point clouds (.obj, .ply, .stl), and the folders of benches, recordings, datasets,"
-    " training runs, weights, replays, exports, files of frames, evaluations, detections and"
-    " trade-offs"
+    " and point clouds (.obj, .ply, .stl), logs of live runs (.csv, .jsonl), and the folders of"
+    " benches, recordings, datasets, training runs, weights, the work of adapt, replays, exports,"
+    " files of frames, evaluations, detections and trade-offs"
 )
 
 

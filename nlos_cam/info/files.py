@@ -1,10 +1,12 @@
 """Description of a file or folder, and readers of single files."""
 
+import csv
 import json
 import re
 import shlex
 import tomllib
 import zlib
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -415,6 +417,26 @@ def _sidecar(path: Path, verify: bool) -> Description:
     return Description(
         "sidecar of a recording", facts, created, made_by, problem, "all fields", following
     )
+
+
+def describe_log(path: Path, _verify: bool) -> Description | None:
+    """Describe the log of a live run from all of its lines."""
+    with path.open(encoding="utf-8", newline="") as file:
+        if path.suffix == ".csv":
+            rows: list[dict[str, Any]] = [*csv.DictReader(file)]
+        else:  # the last line of a killed run may be cut
+            rows = [json.loads(line) for line in file if line.endswith("\n")]
+    if not rows or not {"frame_number", "published_s", "latency_ms"} <= rows[0].keys():
+        return None
+
+    whole = [row for row in rows if row["latency_ms"] not in {None, ""}]
+    latency_ms = np.median([float(row["latency_ms"]) for row in whole])
+    seconds = float(whole[-1]["published_s"]) - float(whole[0]["published_s"])
+    facts = {"frames": str(len(rows)), "duration": f"{seconds:.1f} s"}
+    facts["latency"] = f"{latency_ms:.1f} ms (median)"
+    verdicts = Counter(row.get("verdict") or "no verdict" for row in whole)
+    facts |= {verdict: count(number, "frame") for verdict, number in verdicts.items()}
+    return Description("log of a live run", facts, "", "nlos-cam live", "", "all lines")
 
 
 def describe_page(path: Path, _verify: bool) -> Description | None:

@@ -234,6 +234,23 @@ def _problem_of_arrays(paths: Sequence[Path]) -> str:
     return ""
 
 
+def describe_adaptation(folder: Path, _verify: bool) -> Description:
+    """Describe the work of `adapt` from its plan."""
+    plan = _json(folder / ADAPTATION)
+    stages = plan["stages"]
+    minutes = sum(stage["minutes"] for stage in stages)
+    done = sum((folder / f"stage-{n}" / "weights").exists() for n in range(1, len(stages) + 1))
+    facts = {
+        "rig's checksum": str(plan["rig_checksum"]),
+        "minutes": f"{minutes:g} in {count(len(stages), 'stage')}, {done} done",
+        "objects": str(stages[-1]["objects"]),
+    }
+    following = [f"nlos-cam adapt {shlex.quote(str(folder.parent))} --minutes {minutes:g}"]
+    if (page := folder / "adapt.html").exists():
+        following.insert(0, f"open {shlex.quote(str(page))}")
+    return Description("work of adapt", facts, "", "nlos-cam adapt", "", "plan", following)
+
+
 def describe_detection(folder: Path, verify: bool) -> Description:
     """Describe a detection from its plan, or with `verify` from every turn too."""
     plan = _json(folder / "detection.json")
@@ -295,6 +312,8 @@ def describe_frame_files(folder: Path, _verify: bool) -> Description:
 
 
 FRAME_FILES = f"{FRAME_GLOB}.*"
+ADAPTATION = "plan.json"
+"""Plan of `adapt` in its folder of work."""
 FOLDERS: list[tuple[str, str, Callable[[Path, bool], Description | None]]] = [
     (MANIFEST, "bench", describe_bench),
     ("metadata.yaml", "recording", describe_bag),
@@ -306,6 +325,7 @@ FOLDERS: list[tuple[str, str, Callable[[Path, bool], Description | None]]] = [
     ("figures.json", "evaluation", describe_figures),
     ("tradeoff.json", "trade-off", describe_tradeoff),
     ("detection.json", "detection", describe_detection),
+    (ADAPTATION, "work of adapt", describe_adaptation),
     ("*.bag", "recordings", describe_recordings),
     (FRAME_FILES, "files of single frames", describe_frame_files),
 ]

@@ -38,8 +38,9 @@ class FrameLog:
     """Log file, open while entered: .csv with a header, or one JSON object per line (.jsonl). Used
     by one thread.
 
-    The columns of a .csv are those of its first line. A write error ends the log with a warning,
-    not the run. Raises OSError on entering if the file cannot be opened.
+    The columns of a .csv are those of its first line. An earlier log stays until that line comes. A
+    write error ends the log with a warning, not the run. Raises OSError on entering if the file
+    cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -47,9 +48,10 @@ class FrameLog:
         self._file: IO[str] | None = None
         self._table: csv.DictWriter[str] | None = None
         self._flushed_s = float("-inf")
+        self._begun = False
 
     def __enter__(self) -> Self:
-        self._file = self._path.open("w", encoding="utf-8", newline="")
+        self._file = self._path.open("a", encoding="utf-8", newline="")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -67,6 +69,9 @@ class FrameLog:
         if self._file is None:
             return
         try:
+            if not self._begun:
+                self._file.truncate(0)
+                self._begun = True
             self._write(self._file, log_line(moment))
             if moment.time_s - self._flushed_s >= FLUSH_INTERVAL_S:
                 self._file.flush()

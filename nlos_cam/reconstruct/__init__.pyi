@@ -72,6 +72,7 @@ __all__ = [
     "rig_fields",
     "rig_in_words",
     "rig_to_align_with",
+    "shipped_iou",
     "training_rig",
     "verdict_limits",
     "warm_up",
@@ -133,6 +134,7 @@ from .serving import (
     aligned_terms,
     any_terms,
     differences_of,
+    shipped_iou,
     weights_for,
     weights_serve,
 )

@@ -235,6 +235,7 @@ class Pipeline:
         uncertainty_model: UncertaintyModel | None = None,
         checks: PhysicsCheck | None = None,
         trained: CheckpointRecord | None = None,
+        weights: str = "",
     ) -> None:
         if uses_difference and bench.reference is None:
             raise CalibrationError(
@@ -245,6 +246,8 @@ class Pipeline:
         self.uncertainty_model = uncertainty_model
         self.trained = trained
         """Record of the networks' training; None where it is not known."""
+        self.weights = weights
+        """Name and checksum of the networks' weights, for reports; empty where they are not known."""
         self.checks = checks or NullPhysicsCheck()
         self._verdicts = VerdictFilter(
             verdict_limits(uncertainty_model) if uncertainty_model else None
@@ -449,6 +452,7 @@ def build_pipeline(
     *,
     uncertainty_model: UncertaintyModel | None = None,
     checks: PhysicsCheck | None = None,
+    weights: str = "",
 ) -> Pipeline:
     """Build a pipeline with raw or difference maps, depending on the networks' input."""
     return Pipeline(
@@ -459,6 +463,7 @@ def build_pipeline(
         uncertainty_model=uncertainty_model,
         checks=checks,
         trained=network.record,
+        weights=weights,
     )
 
 

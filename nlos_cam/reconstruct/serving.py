@@ -15,7 +15,15 @@ from nlos_calibration import (
     rig_difference,
     view_difference_deg,
 )
-from nlos_models import BENCH_WEIGHTS, DIRECT, WIDE, CheckpointRecord, load_record, shipped_folder
+from nlos_models import (
+    BENCH_WEIGHTS,
+    DIRECT,
+    WIDE,
+    CheckpointRecord,
+    load_record,
+    shipped_folder,
+    weights_folder,
+)
 
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct.alignment import (
@@ -57,6 +65,9 @@ class WeightsVerdict:
     expected_iou: float | None = None
     """Silhouette IoU that weights trained for this bench can be expected to reach; None where it
     was not forecast."""
+    present_iou: float | None = None
+    """Silhouette IoU that these weights can be expected to reach on this bench; None where it is
+    not known."""
     falls_short: bool = False
     """True for weights that were trained for this bench, and reached less than was forecast."""
 
@@ -66,18 +77,30 @@ class WeightsVerdict:
         return self.service != "trained for it" or self.falls_short
 
     @property
+    def adapting_helps(self) -> bool:
+        """True unless weights trained for this bench are expected to do no better than these."""
+        if self.expected_iou is None or self.present_iou is None:
+            return True
+        return self.expected_iou > self.present_iou
+
+    @property
     def serve(self) -> bool:
         """True if pictures are about as right as on the rig of the weights."""
         return self.service in {"trained for it", "near"}
 
 
 def weights_serve(
-    rig: Rig, trained: CheckpointRecord, *, expected_iou: float | None = None, bench: str = "bench/"
+    rig: Rig,
+    trained: CheckpointRecord,
+    *,
+    expected_iou: float | None = None,
+    present_iou: float | None = None,
+    bench: str = "bench/",
 ) -> WeightsVerdict:
     """Return whether weights serve the rig of a bench, by its distance from their own rig.
 
-    `expected_iou` is a forecast for weights trained for this rig, and `bench` the folder to train
-    them in.
+    `expected_iou` is a forecast for weights trained for this rig, `present_iou` what these can be
+    expected to reach (`shipped_iou`), and `bench` the folder to train others in.
     """
     # Weights on the wall grid hold a rig where training went on for it.
     wanted = own_rig(trained) if grid_of(trained) else training_rig(trained)
@@ -85,11 +108,12 @@ def weights_serve(
         sentence = "the weights serve this bench: they were trained for its rig"
         return WeightsVerdict("trained for it", sentence, expected_iou)
 
-    forecast = "" if expected_iou is None else f" (expected silhouette IoU {expected_iou:.2f})"
-    advice = f"`nlos-cam adapt {bench}` trains weights for it{forecast}"
+    advice = (
+        f"`nlos-cam adapt {bench}` trains weights for it{_prospects(expected_iou, present_iou)}"
+    )
     if grid_of(trained) and (wanted or not trained.rig):
         service, sentence = _grid_serves(rig, wanted)
-        return WeightsVerdict(service, f"{sentence}; {advice}", expected_iou)
+        return WeightsVerdict(service, f"{sentence}; {advice}", expected_iou, present_iou)
     if wanted is None:
         sentence = (
             f"the networks were trained for another rig than {rig.name}: expect larger errors;"
@@ -99,7 +123,16 @@ def weights_serve(
 
     service, outcome = _aligned_serves(rig, trained, wanted)
     difference = "; ".join(rig_difference(rig, wanted))
-    return WeightsVerdict(service, f"the weights {outcome} ({difference}); {advice}", expected_iou)
+    sentence = f"the weights {outcome} ({difference}); {advice}"
+    return WeightsVerdict(service, sentence, expected_iou, present_iou)
+
+
+def _prospects(expected_iou: float | None, present_iou: float | None) -> str:
+    """Return in parentheses what weights of its own, and those in use, can reach on a bench."""
+    if expected_iou is None:
+        return ""
+    present = "" if present_iou is None else f"; those in use about {present_iou:.2f}"
+    return f" (expected silhouette IoU {expected_iou:.2f} after hours of training{present})"
 
 
 def _aligned_serves(rig: Rig, trained: CheckpointRecord, own: Rig) -> tuple[Service, str]:
@@ -205,6 +238,15 @@ def weights_for(rig: Rig, names: Sequence[str] = BENCH_WEIGHTS) -> Path:
     if rig.occluder is None:  # how wide its gap is decides
         return shipped_folder(names[0])
     return shipped_folder(max(names, key=lambda name: _shipped_iou(rig, name)))
+
+
+def shipped_iou(rig: Rig, weights: Path) -> float | None:
+    """Return the silhouette IoU that can be expected of a folder of shipped weights on a rig; None
+    for other weights, for those of the paper's network, and for a rig without an occluder.
+    """
+    folder = weights_folder(weights)
+    names = [name for name in BENCH_WEIGHTS if shipped_folder(name) == folder]
+    return _shipped_iou(rig, names[0]) if names and rig.occluder else None
 
 
 def _shipped_iou(rig: Rig, name: str) -> float:

@@ -111,6 +111,11 @@ class Place:
     """When it was recorded, on the recorder's clock, which starts at 0."""
 
 
+def packaged_or_file(path: Path) -> Path:
+    """Return the packaged recording for its name, unless a file is called so; else the path."""
+    return SAMPLE if str(path) == SAMPLE.stem and not path.is_file() else path
+
+
 class BagReader:
     """Recording of any RealSense camera; frames are read on request.
 
@@ -120,7 +125,7 @@ class BagReader:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path = SAMPLE if str(path) == SAMPLE.stem and not path.is_file() else path
+        self.path = path = packaged_or_file(path)
         self.entries: dict[str, list[Entry]] = {}
         """Messages of each topic, in order of time."""
         self.types: dict[str, str] = {}

@@ -244,8 +244,9 @@ def export_recording(
     """Write the selected frames of a recording into the directory `out`.
 
     What an earlier export wrote there goes. Setting `stop` ends it early and keeps the frames so
-    far, and so does damage within the recording. Raises RecordingError for streams that the
-    recording does not have, and where there is no frame to write.
+    far, and so does damage within the recording; before the first frame it raises KeyboardInterrupt
+    and writes nothing. Raises RecordingError for streams that the recording does not have, and where
+    there is no frame to write.
     """
     streams = _streams(bag, options)
     written: Counter[str] = Counter(dict.fromkeys(streams, 0))
@@ -274,14 +275,19 @@ def export_recording(
                         points.add(sample, instant)
             except RecordingError as error:
                 damage = str(error)
-        if not written.total() and not stop.is_set():
-            raise RecordingError(
-                f"{bag.path} has no frame to write"
-                + (f" ({damage})" if damage else f": it has {', '.join(streams)}")
-            )
+        reason = f" ({damage})" if damage else f": it has {', '.join(streams)}"
+        require_frames(written, stop, f"{bag.path} has no frame to write{reason}")
     if points:
         written[POINTS] = points.written
     return ExportResult(dict(written), str(out), damage)
+
+
+def require_frames(written: Counter[str], stop: Event, problem: str) -> None:
+    """Raise for an export without a frame: KeyboardInterrupt if it was stopped before the first, so
+    that what it would replace stays, else RecordingError.
+    """
+    if not written.total():
+        raise KeyboardInterrupt if stop.is_set() else RecordingError(problem)
 
 
 def _written_before(out: Path) -> list[str]:

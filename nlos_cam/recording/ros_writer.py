@@ -32,7 +32,7 @@ from nlos_cam.files import atomic_directory
 from nlos_cam.recording.bag_messages import CAMERA, IMAGE
 from nlos_cam.recording.bag_reader import BagReader, StreamInfo
 from nlos_cam.recording.device_clock import unwrapped_samples
-from nlos_cam.recording.export import ExportResult
+from nlos_cam.recording.export import ExportResult, require_frames
 from nlos_cam.recording.ros_messages import METADATA, SDK_LENSES, TRANSFORMS, ros2_types
 
 if TYPE_CHECKING:
@@ -99,7 +99,8 @@ def export_ros2(
     """Write a recording's images, camera_info, metadata and static transforms as a bag of ROS 2.
 
     Setting `stop` ends it early and keeps the frames so far, and so does damage within the
-    recording. Raises RecordingError without a stream to write.
+    recording; before the first frame it raises KeyboardInterrupt and writes nothing. Raises
+    RecordingError without a stream or a frame to write.
     """
     streams = [name for name, info in bag.streams.items() if _is_writable(info)]
     if not streams:
@@ -132,8 +133,8 @@ def export_ros2(
         for path in folder.iterdir():
             path.rename(part / path.name)
         folder.rmdir()
-        if not written.total() and not stop.is_set():
-            raise RecordingError(f"{bag.path} has no frame to write" + (damage and f" ({damage})"))
+        reason = damage and f" ({damage})"
+        require_frames(written, stop, f"{bag.path} has no frame to write{reason}")
     return ExportResult(dict(written), str(out), damage)
 
 

@@ -21,6 +21,7 @@ from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_file, describe, program_commit, read_bounded
 from nlos_cam.frames import Frame
 from nlos_cam.recording.bag_messages import finite
+from nlos_cam.recording.bag_reader import packaged_or_file
 from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality
 
@@ -114,8 +115,14 @@ class Sidecar(Record):
 
 
 def sidecar_path(recording: Path) -> Path:
-    """Return F.json for F.bag."""
-    return recording.with_suffix(SIDECAR_SUFFIX)
+    """Return F.json for F.bag, and for a bag of ROS 2 in a folder F; that of the packaged recording
+    does not exist.
+    """
+    recording = packaged_or_file(recording)
+    if not recording.is_dir():
+        return recording.with_suffix(SIDECAR_SUFFIX)
+    named = recording if recording.name not in {"", ".."} else recording.resolve()
+    return named.with_name(f"{named.name}{SIDECAR_SUFFIX}")
 
 
 def load_sidecar(path: Path) -> Sidecar:

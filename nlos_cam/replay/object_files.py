@@ -15,15 +15,13 @@ from nlos_cam.errors import RecordingError
 from nlos_cam.files import atomic_directory, read_arrays
 from nlos_cam.objects import mesh_from_depth
 from nlos_cam.reconstruct import ignore
-from nlos_cam.recording import FRAME_GLOB, FRAME_STEM, FrameNames
+from nlos_cam.recording import FRAME_STEM, FrameNames
 
 OBJECT_FORMATS = ("ply", "glb", "obj", "csv", "npz", "points")
 """Suffixes of `SurfaceMesh.save`, and "points" for a .ply without faces."""
 ENDINGS = {name: "-points.ply" if name == "points" else f".{name}" for name in OBJECT_FORMATS}
 OBJECT_FILE = re.compile(rf"{FRAME_STEM}({'|'.join(map(re.escape, ENDINGS.values()))})")
 """Names that ObjectFiles gives."""
-OBJECT_PATTERNS = [f"{FRAME_GLOB}{ending}" for ending in ENDINGS.values()]
-"""The same names, as patterns of `fnmatch`."""
 
 
 @dataclass
@@ -72,12 +70,14 @@ def export_objects(
     """Write the hidden surfaces of a replay's reconstruction.npz into the folder `out`; return
     their number.
 
-    Setting `stop` ends it early and keeps the files so far. Raises RecordingError for any other
-    file, and where no frame has a surface.
+    Setting `stop` ends it early and keeps the files so far; before the first one it raises
+    KeyboardInterrupt and writes nothing. Raises RecordingError for any other file, and where no
+    frame has a surface.
     """
     arrays, box = _read(result)
     numbers = arrays["frame_number"]
-    with atomic_directory(out, drop=OBJECT_PATTERNS) as part:
+    earlier = [path.name for path in out.glob("*") if OBJECT_FILE.fullmatch(path.name)]
+    with atomic_directory(out, drop=earlier) as part:
         files = ObjectFiles(part, box, formats, every)
         for k, number in enumerate(numbers):
             if stop.is_set():
@@ -86,7 +86,9 @@ def export_objects(
             is_known = np.isfinite(uncertainty_m).any()
             files.add(int(number), arrays["depth_m"][k], uncertainty_m if is_known else None)
             on_frame(k + 1, len(numbers))
-        if not files.written and not stop.is_set():
+        if not files.written and stop.is_set():
+            raise KeyboardInterrupt
+        if not files.written:
             raise RecordingError(
                 f"{result} has no hidden surface in {_frames(len(numbers), every)}: nothing was"
                 " written"

@@ -54,6 +54,8 @@ class ReplayReport:
     """Of the frames with an object: medians `expected_iou` and `expected_error_mm`, share
     `trusted`; empty without.
     """
+    weights: str = ""
+    """Name and checksum of the networks' weights."""
 
 
 def replay_recording(
@@ -89,6 +91,7 @@ def replay_recording(
             lambda: files.enter_context(TemporaryFile(dir=part)),
             on_warning,
             _unexplained_empty(pipeline),
+            pipeline.weights,
         )
         frames, telemetry = with_telemetry(camera)
         reader = FrameReader(frames, lossless=True, stop=stop, clock=clock)
@@ -121,6 +124,7 @@ def replay_recording(
         warnings=results.warnings.frames,
         verdicts=results.verdicts,
         quality=results.quality.summary,
+        weights=pipeline.weights,
     )
 
 

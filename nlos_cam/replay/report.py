@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nlos_cam.camera import Camera
+from nlos_cam.camera import SIMULATED_SERIAL, Camera
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.reconstruct import UNEXPLAINED, CalibratedRig, Verdict, describe_counts
 from nlos_cam.replay.results import ReplayResults
@@ -79,6 +79,8 @@ def replay_document(
         f" {1e3 * rig.lidar.distance_m:.0f} mm to the wall, facing {rig.facing_deg:.1f}°"
     )
     notes = ["Interrupted: only the frames up to then are included."] if interrupted else []
+    if camera.identity.get("serial") == SIMULATED_SERIAL:
+        notes.append("A recording of the simulated camera: it says nothing about a real L515.")
     notes += [
         f"warning in {each.frames} frames, from {each.first} to {each.last}: {each.text}"
         for each in results.warnings.spans
@@ -153,6 +155,8 @@ def _reconstruction(results: ReplayResults, bench: CalibratedRig) -> dict[str, s
             f" maps, 1: no better than an empty bench); {sum(each.unexplained for each in checks)} of"
             f" {len(checks)} checked frames at {UNEXPLAINED:g} or more{without}"
         )
+    if results.weights:
+        facts["weights"] = results.weights
     if bench.reference:
         facts["difference maps"] = (
             f"from the bare wall, the mean of {bench.reference.frames} frames"

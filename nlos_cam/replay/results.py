@@ -59,13 +59,18 @@ class ReplayResults:
     """Collector of the frames' results; `new_file` opens the files of the large arrays.
 
     `unexplained_empty` is the score of the physics check from which on maps without a surface are
-    not explained; with one it is UNEXPLAINED.
+    not explained; with one it is UNEXPLAINED. `weights` are name and checksum of the networks'.
     """
 
     def __init__(
-        self, new_file: NewFile, on_warning: OnWarning, unexplained_empty: float = UNEXPLAINED
+        self,
+        new_file: NewFile,
+        on_warning: OnWarning,
+        unexplained_empty: float = UNEXPLAINED,
+        weights: str = "",
     ) -> None:
         self.unexplained_empty = unexplained_empty
+        self.weights = weights
         self.numbers: list[int] = []
         self.timestamps_s: list[float] = []
         self.frames_with_surface = 0
@@ -146,6 +151,7 @@ class ReplayResults:
             "z_near_m": box.z_near_m,
             "z_far_m": box.z_far_m,
             "check_frame_number": np.array([each.number for each in self.checks], np.int64),
+            "weights": np.array(self.weights, np.str_),
             "check_score": np.array([each.score for each in self.checks], np.float64),
         }
 

@@ -96,7 +96,7 @@ class SessionFile:
     """Writer of ten moments per second to an HTML file, in its own thread while entered.
 
     A moment that finds the queue full is skipped, or waited for with `keeps_all`. An existing file
-    is replaced. After a kill the file lacks its last second and plays. A file that takes no more,
+    is replaced by the first moment. After a kill the file lacks its last second and plays. A file that takes no more,
     as the disk is full, says so in `problem`; leaving it then raises the error.
     """
 
@@ -122,7 +122,7 @@ class SessionFile:
 
     def __enter__(self) -> Self:
         # A path that cannot be written to is an error now, not in the thread.
-        self.path.open("wb").close()
+        self.path.open("ab").close()
         self._thread.start()
         return self
 
@@ -160,13 +160,17 @@ class SessionFile:
 
     def _write(self) -> None:
         try:
+            moment = self._queue.take()
+            if moment is None and self.path.stat().st_size:
+                return  # an earlier session
             with self.path.open("wb") as file:
                 file.write(page_html("session").encode())
                 file.write(element(self._bench))
-                while (moment := self._queue.take()) is not None:
+                while moment is not None:
                     if not self.full:
                         self._append(file, self._chunks.add(moment))
                         self.kept += 1
+                    moment = self._queue.take()
                 self._append(file, self._chunks.rest())
         except Exception as error:  # noqa: BLE001  whatever it was, who entered raises it
             self._error = error

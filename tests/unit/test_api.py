@@ -215,6 +215,8 @@ def test_stream_stops_camera_after_error_and_needs_a_start(opened: Open) -> None
         next(stream).frame_number // 0
 
     assert camera.closed.is_set()
+    with pytest.raises(NlosCamError, match="start another"), stream:
+        pytest.fail("its checks have ended")
 
 
 def test_stream_that_cannot_start_leaves_its_camera(

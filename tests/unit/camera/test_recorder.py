@@ -389,6 +389,18 @@ def test_step_of_the_clock_changes_no_take(tmp_path: Path, found: FrameSet, step
     assert recording.sets == 60
 
 
+def test_take_covers_frames_that_the_camera_moved_in_time(tmp_path: Path, found: FrameSet) -> None:
+    recording = Recording(tmp_path / "a.bag", frames=3)
+    recording.begin("device", SDK)
+    for number in range(3):
+        recording.add(replace(found, number=number, timestamp_s=number / 30), number / 30)
+    recording.added_s = -3600.1  # the host's clock was set forward in an outage
+    times_s = [number / 30 - 3600.1 for number in range(5)]
+    recording.close()
+
+    assert [recording.covers(time_s) for time_s in times_s] == [True] * 3 + [False] * 2
+
+
 def old_pair(folder: Path) -> dict[str, str]:
     """Write a recording and its sidecar, and return their contents."""
     pair = {"a.bag": "an old file", "a.json": "its sidecar"}

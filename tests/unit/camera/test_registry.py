@@ -44,8 +44,12 @@ def test_path_of_a_recording_chooses_the_playback(noise_bag: Path, tmp_path: Pat
     assert camera.uri == f"bag:{path}"
 
 
-def test_recording_is_a_camera_by_its_path_and_by_its_name(noise_bag: Path) -> None:
+def test_recording_is_a_camera_by_its_path_and_by_its_name(
+    noise_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert open_camera(noise_bag).uri == f"bag:{noise_bag}"
+    monkeypatch.chdir(tmp_path)
+    Path("sample").mkdir()  # no recording
     assert open_camera("sample").uri == "bag:sample"
 
 

@@ -223,14 +223,13 @@ def forecast(
 def verdict(folder: Path) -> str:
     """Return the verdict on the weights that a bench uses."""
     loaded = load_bench(folder)
-    trained = load_record(weights_folder(loaded.weights))
-    return weights_verdict(loaded.rig, trained, loaded).sentence
+    return weights_verdict(loaded.rig, weights_folder(loaded.weights), loaded).sentence
 
 
 def test_verdict_on_weights_names_the_record_without_a_bench() -> None:
-    direct = load_record(shipped_folder())
+    wall = Path("my wall.toml")
 
-    sentence = weights_verdict(load_rig("wide-rig"), direct, None, Path("my wall.toml")).sentence
+    sentence = weights_verdict(load_rig("wide-rig"), shipped_folder(), None, wall).sentence
 
     assert "nlos-cam adapt 'my wall.toml'" in sentence
 
@@ -241,10 +240,12 @@ def test_verdict_on_weights_names_adapt_and_the_forecast(bench: Path) -> None:
     lidar = loaded.rig.lidar.model_copy(update={"distance_m": 0.25})
     farther = loaded.rig.model_copy(update={"lidar": lidar})
 
-    sentence = weights_verdict(farther, load_record(shipped_folder()), loaded).sentence
+    verdict = weights_verdict(farther, shipped_folder(), loaded)
 
-    assert "nlos-cam adapt bench" in sentence
-    assert "expected silhouette IoU 0.64" in sentence
+    assert "nlos-cam adapt bench" in verdict.sentence
+    assert "expected silhouette IoU 0.64 after hours of training; those" in verdict.sentence
+    assert f"in use about {verdict.present_iou:.2f})" in verdict.sentence
+    assert verdict.adapting_helps is (verdict.present_iou < 0.64)
 
 
 def test_verdict_on_weights_says_how_many_objects_are_hidden(bench: Path) -> None:

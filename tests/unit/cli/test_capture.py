@@ -13,7 +13,7 @@ import pytest
 
 from nlos_cam.camera import Recording, SimulatedCamera
 from nlos_cam.cli import capture
-from nlos_cam.cli.capture import final_error, format_take, result_of
+from nlos_cam.cli.capture import final_error, format_take, format_takes, result_of
 from nlos_cam.errors import CameraLostError, DiskFullError
 from nlos_cam.recording import CaptureResult, CaptureTarget, VerifyResult, load_sidecar, verify
 from nlos_cam.recording.quality import Quality
@@ -63,7 +63,9 @@ def test_capture_json_reports_the_file(run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_capture_numbers_and_labels_takes_and_pauses_between(run: Run, monkeypatch: Patch) -> None:
+def test_capture_numbers_and_labels_takes_and_pauses_between(
+    run: Run, monkeypatch: Patch, lines: list[str]
+) -> None:
     paused: list[float | None] = []
     monkeypatch.setattr(
         capture, "_pause", lambda _bar, _stop, pause_s, _text: paused.append(pause_s)
@@ -74,6 +76,7 @@ def test_capture_numbers_and_labels_takes_and_pauses_between(run: Run, monkeypat
     assert found["frames"] == 12
     assert found["dropped"] == 0
     assert paused == [7.0, 7.0]
+    assert [line.split()[-1] for line in lines] == ["a-01.bag", "a-02.bag", "a-03.bag"]
 
     for number, (take, label) in enumerate(zip(found["takes"], labels[1::2], strict=True), start=1):
         path = Path(f"a-0{number}.bag")
@@ -258,6 +261,11 @@ def test_lines_at_the_terminal_hold_the_figures() -> None:
     for word in ("30 frames", "1.0 s", "3 MB", "verified", "0.10 %", "25.0 %", "1.23 mm", "a.bag"):
         assert word in text
 
+    targets = [CaptureTarget(OUT)] * 3
+    assert format_takes([take()], targets[:1]) == text
+    unread = take(state="interrupted", verified=None)
+    assert format_takes([take(), unread], targets) == "Recorded 2 of 3 takes, 30 frames in all"
+    assert format_takes([take(), take()], targets) == "Recorded 2 of 3 takes, 60 frames in all"
     assert "unknown" in format_take(take(quality=Quality(1, 0.0, 0.0)))
     assert "verified" not in format_take(take(state="damaged"))
 

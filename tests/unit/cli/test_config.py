@@ -106,6 +106,24 @@ def test_paths_of_the_users_file_are_relative_to_it(folders: tuple[Path, Path]) 
     assert settings["camera"].value == f"sim:{folders[1] / 'scene.toml'}"
 
 
+@pytest.mark.parametrize("name", ["run.bag", "ros.mcap", "ros.db3", "ros"])
+def test_recording_of_the_users_file_is_relative_to_it(
+    folders: tuple[Path, Path], name: str
+) -> None:
+    (folders[1] / "ros").mkdir()
+    (folders[1] / "ros" / "metadata.yaml").touch()
+    (folders[1] / FILE).write_text(f'camera = "{name}"', encoding="utf-8")
+
+    assert read_settings({})["camera"].value == str(folders[1] / name)
+
+
+def test_bench_of_the_settings_is_not_used_with_the_sample(live: list[dict[str, Any]]) -> None:
+    Path(FILE).write_text('wall = "mine.toml"\n', encoding="utf-8")
+
+    assert main(["live", "sample"]) == 0
+    assert (live[0]["camera"], live[0]["wall"]) == ("bag:sample", None)
+
+
 def test_shipped_weights_are_named_in_the_users_file(folders: tuple[Path, Path]) -> None:
     (folders[1] / FILE).write_text('weights = "wide"', encoding="utf-8")
     named = read_settings({})["weights"].value

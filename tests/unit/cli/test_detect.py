@@ -113,6 +113,7 @@ def test_unknown_power_is_null_and_said_in_words(
     page = (folder / "detection.html").read_text(encoding="utf-8")
     assert "power was not determined" in page
     assert "inf mm" not in page
+    assert "says nothing about a real L515" in page
 
 
 def test_wrong_number_of_turns_is_refused_in_one_line(run: Run, tmp_path: Path) -> None:

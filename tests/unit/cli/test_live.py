@@ -232,7 +232,8 @@ def test_replay_notes_the_wall_of_the_recording(run: Run, monkeypatch: pytest.Mo
 def test_replay_writes_its_folder_and_one_json_object(opened: Opened, run: Run) -> None:
     report = run(*REPLAY)
 
-    assert set(report) == {"frames", "seconds", "out", "warnings", "verdicts", "quality"}
+    fields = {"frames", "seconds", "out", "warnings", "verdicts", "quality", "weights"}
+    assert set(report) == fields
     assert report["frames"] == 20
     assert report["out"] == "out"
     assert "aligned with their rig" not in report.err
@@ -425,8 +426,8 @@ def test_view_of_a_recording_takes_the_weights_of_its_bench(
     words = ["view", "run.bag", "--seconds", "0.1"]
 
     assert main([*words, "--bench", str(bench)]) == 0
-    assert main([*words, "--bench", str(bench), "--weights", str(tmp_path)]) == 0
-    assert taken == [own, tmp_path]
+    assert main([*words, "--bench", str(bench), "--weights", str(shipped_folder("wide"))]) == 0
+    assert taken == [own, shipped_folder("wide")]
 
 
 @pytest.fixture

@@ -140,6 +140,18 @@ def test_atomic_directory_replaces_entries_by_name(
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+@pytest.mark.parametrize("mode", [0o700, 0o2775])
+def test_atomic_directory_keeps_the_permissions_of_the_old_one(tmp_path: Path, mode: int) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    out.chmod(mode)
+    with atomic_directory(out) as part:
+        (part / "new.txt").write_text("new")
+
+    assert out.stat().st_mode & 0o7777 == mode
+    assert (out / "new.txt").exists()
+
+
 def test_dropped_files_are_no_folders_nor_links_to_them(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (out / "folder").mkdir(parents=True)

@@ -11,13 +11,17 @@ import pytest
 from fake_workers import samples_of
 from made_benches import make_bench
 from made_turns import made_plan, made_turns
+from made_up_moments import moment, with_result
 from nlos_calibration import load_rig
 from rewritten_bags import Messages, rewrite
 
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.detect import Session
+from nlos_cam.errors import RecordingError
 from nlos_cam.info import Description, describe
+from nlos_cam.live import FrameLog
+from nlos_cam.reconstruct import Verdict
 from nlos_cam.recording import ReplayCamera, SidecarFile, sidecar_path
 from nlos_cam.recording.quality import Quality
 from nlos_cam.recording.sidecar import summary_of
@@ -151,6 +155,38 @@ def test_run_has_the_last_figures_of_its_log(tmp_path: Path) -> None:
         "state": "not finished: the same command resumes",
         "last loss": "0.25",
     }
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".jsonl"])
+def test_log_of_a_live_run_has_its_frames_and_verdicts(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"log{suffix}"
+    with FrameLog(path) as log:
+        for number in range(3):
+            log.add(with_result(moment(number), verdict=Verdict.SEEN if number else None))
+    with path.open("a") as file:
+        file.write('{"frame' if suffix == ".jsonl" else "3,0.1,")  # a killed run
+    found = described(path)
+
+    assert found.kind == "log of a live run"
+    assert found.facts["frames"] == ("3" if suffix == ".jsonl" else "4")
+    assert (found.facts["no verdict"], found.facts["object seen"]) == ("1 frame", "2 frames")
+
+
+def test_table_that_is_no_log_is_of_no_known_kind(tmp_path: Path) -> None:
+    (tmp_path / "mine.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(RecordingError, match="no known kind"):
+        describe(tmp_path / "mine.csv")
+
+
+def test_work_of_adapt_has_its_minutes(tmp_path: Path) -> None:
+    stages = [{"minutes": 1.0, "objects": 1000}, {"minutes": 9.0, "objects": 5000}]
+    work = tmp_path / "my bench" / "adapt"
+    (work / "stage-1" / "weights").mkdir(parents=True)
+    (work / "plan.json").write_text(json.dumps({"rig_checksum": "bbd36036f151", "stages": stages}))
+    found = described(work)
+
+    assert found.facts["minutes"] == "10 in 2 stages, 1 done"
+    assert found.next == [f"nlos-cam adapt '{tmp_path / 'my bench'}' --minutes 10"]
 
 
 @pytest.mark.parametrize(

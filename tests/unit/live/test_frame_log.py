@@ -76,6 +76,18 @@ def test_log_keeps_its_columns_when_a_stage_comes_later(tmp_path: Path) -> None:
     assert second["queue_ms"] == ""
 
 
+def test_earlier_log_stays_until_the_first_frame(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("an earlier run's\n")
+    with FrameLog(path):
+        pass
+    assert path.read_text() == "an earlier run's\n"
+
+    with FrameLog(path) as log:
+        log.add(moment(7))
+    assert [line["frame_number"] for line in lines_of(path)] == ["7"]
+
+
 def test_log_ends_on_a_full_disk_without_ending_the_run(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

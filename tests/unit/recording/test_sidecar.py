@@ -38,6 +38,18 @@ READ = VerifyResult(
 )
 
 
+def test_sidecar_is_named_like_its_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "bench1.5m"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+
+    assert sidecar_path(Path("a.bag")) == Path("a.json")
+    assert sidecar_path(folder) == sidecar_path(Path()) == tmp_path / "bench1.5m.json"
+    assert not sidecar_path(Path("sample")).is_relative_to(tmp_path)  # in the package
+
+
 @dataclass
 class Warm:
     uri: str = "l515"

@@ -49,17 +49,28 @@ def test_export_of_a_result_equals_the_files_of_its_replay(replay: Path, tmp_pat
 def test_export_replaces_the_files_of_an_earlier_one(replay: Path, tmp_path: Path) -> None:
     out = tmp_path / "exported"
     export_objects(replay / RESULT, out, OBJECT_FORMATS, stop=Event())
-    (out / "notes.csv").write_text("mine")
+    for mine in ("notes.csv", "20241003-notes.csv", "123456789-scan.ply"):
+        (out / mine).write_text("mine")
     export_objects(replay / RESULT, out, ["ply"], 3, stop=Event())
 
-    assert names_in(out) == ["000000.ply", "000003.ply", "000006.ply", "notes.csv"]
+    written = ["000000.ply", "000003.ply", "000006.ply"]
+    assert names_in(out) == sorted(
+        [*written, "notes.csv", "20241003-notes.csv", "123456789-scan.ply"]
+    )
 
 
-def test_export_stops_when_asked(replay: Path, tmp_path: Path) -> None:
+def test_stopped_export_keeps_its_files_or_the_earlier_ones(replay: Path, tmp_path: Path) -> None:
     stop = Event()
-    stop.set()
+    command = replay / RESULT, tmp_path / "a", ["ply"]
 
-    assert export_objects(replay / RESULT, tmp_path / "a", ["ply"], stop=stop) == 0
+    def after_two(done: int, _: int) -> None:
+        if done == 2:
+            stop.set()
+
+    assert export_objects(*command, stop=stop, on_frame=after_two) == 2
+    with pytest.raises(KeyboardInterrupt):
+        export_objects(*command, stop=stop)
+    assert names_in(tmp_path / "a") == ["000000.ply", "000001.ply"]
 
 
 def changed(replay: Path, path: Path, **arrays: object) -> Path:

@@ -13,7 +13,8 @@ from fake_wall import WallCamera, measured_wall, wall_frame
 from made_up_moments import RIG, Recorded, full_moment
 from nlos_calibration.arrays import Float32
 from page_reader import read_page
-from replays import BENCH, NAMES, TEXT, left_half, replay_noise, replay_wall, text_of
+from replays import BENCH, NAMES, TEXT, left_half, noise_frame, replay_noise, replay_wall, text_of
+from small_frames import FrameCamera
 
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.frames import LidarMaps
@@ -190,6 +191,21 @@ def test_report_suggests_a_replay_of_the_same_bench(tmp_path: Path) -> None:
     command = "replay fake.bag --wall 'my wall.toml' --average 4 --stills 6 --video"
 
     assert command in text_of(tmp_path / "out")
+
+
+@pytest.mark.parametrize(("serial", "said"), [("simulated", True), ("f0123456", False)])
+def test_report_says_that_a_recording_was_simulated(
+    tmp_path: Path, serial: str, said: bool
+) -> None:
+    camera = FrameCamera(2, make=noise_frame)
+    camera.identity = {"serial": serial}
+    pipeline = Pipeline(BENCH, left_half, weights="direct 89ce399040ef")
+    report = replay_recording(camera, pipeline, tmp_path / "out", stop=Event())
+    text = text_of(tmp_path / "out")
+
+    assert ("nothing about a real L515" in text) == said
+    assert "direct 89ce399040ef" in text
+    assert report.weights == "direct 89ce399040ef"
 
 
 def test_interrupted_replay_keeps_its_results(tmp_path: Path) -> None:

@@ -248,6 +248,17 @@ def test_session_keeps_ten_moments_a_second_in_one_page(saved: Path) -> None:
     assert kinds == ["bench", "chunk", "chunk", "chunk"]
 
 
+def test_earlier_session_stays_until_the_first_moment(saved: Path) -> None:
+    before = saved.read_bytes()
+    with SessionFile(saved, RIG):
+        pass
+    assert saved.read_bytes() == before
+
+    with SessionFile(saved, RIG) as session:
+        session.show(full_moment(7))
+    assert [each["frame"] for each in saved_moments(saved)] == [7]
+
+
 @pytest.mark.parametrize("share", [0.85, 0.9, 0.99])
 def test_cut_session_lacks_only_its_end(saved: Path, tmp_path: Path, share: float) -> None:
     content = saved.read_bytes()
@@ -296,8 +307,9 @@ def test_session_that_the_disk_ends_has_a_problem(
     monkeypatch.setattr(base64, "b64encode", Mock(side_effect=OSError(28, "No space left")))
     entered = ExitStack()
     session = entered.enter_context(SessionFile(tmp_path / "view.html", RIG))
-    session._thread.join()
     session.show(moment(0))
+    session._thread.join()
+    session.show(moment(30))
     with pytest.raises(OSError, match="No space"):
         entered.close()
 
