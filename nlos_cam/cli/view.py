@@ -138,10 +138,7 @@ Wall = Annotated[
 Seconds = Annotated[
     float | None,
     typer.Option(
-        "--seconds",
-        min=0.1,
-        max=MAX_S,
-        help="Stop after this many seconds (default: run until Ctrl-C).",
+        "--seconds", min=0.1, help="Stop after this many seconds (default: run until Ctrl-C)."
     ),
 ]
 ViewSeconds = Annotated[

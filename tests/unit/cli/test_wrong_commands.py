@@ -37,6 +37,7 @@ liev | live
 live --secs 3 | --seconds
 live --seconds | needs a value
 live --seconds inf --camera l615 | l615
+view sample --seconds inf | 1e+09
 live --seconds 0 | 0.1
 live --seconds x | number
 live --view-port 0 | 65535
