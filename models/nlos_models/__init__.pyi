@@ -46,6 +46,7 @@ __all__ = [
     "load_uncertainty_network",
     "quality_features",
     "shipped_folder",
+    "shipped_name",
     "silhouette_iou",
     "split_and_stack",
     "surface",
@@ -104,6 +105,7 @@ from .records import (
     checksum_of_watched,
     load_record,
     shipped_folder,
+    shipped_name,
     weights_folder,
 )
 from .uncertainty_network import load_uncertainty_network

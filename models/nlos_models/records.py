@@ -144,6 +144,12 @@ def shipped_folder(name: str = DIRECT) -> Path:
     return Path(str(resources.files("nlos_models") / "weights" / name))
 
 
+def shipped_name(weights: Path) -> str | None:
+    """Return the name of weights that come with the package, by name or folder; None for others."""
+    folder = weights_folder(weights)
+    return next((name for name in SHIPPED if shipped_folder(name) == folder), None)
+
+
 def weights_folder(weights: Path | None, default: str = DIRECT) -> Path:
     """Return the folder of weights: the package's for None, and for a name in SHIPPED unless a
     folder has that name.

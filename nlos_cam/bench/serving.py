@@ -9,13 +9,12 @@ from typing import NamedTuple
 
 from nlos_calibration import Rig
 from nlos_models import (
-    SHIPPED,
     CheckpointRecord,
     Reconstructor,
     UncertaintyModel,
     checksum_of_watched,
     load_record,
-    shipped_folder,
+    shipped_name,
     weights_folder,
 )
 
@@ -61,9 +60,7 @@ def load_serving(
 
 def _weights_in_words(weights: Path) -> str:
     """Return what a reader needs to find weights again, such as "direct 89ce399040ef"."""
-    folder = weights_folder(weights)
-    shipped = [name for name in SHIPPED if shipped_folder(name) == folder]
-    return f"{shipped[0] if shipped else folder} {checksum_of_watched(folder)}"
+    return f"{shipped_name(weights) or weights} {checksum_of_watched(weights_folder(weights))}"
 
 
 def weights_verdict(

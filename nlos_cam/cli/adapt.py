@@ -134,7 +134,6 @@ def adapt(
         begin_again=overwrite,
         **optional,
     )
-    so_far = f"what was made is kept in {work}; give the same command to go on"
     try:
         with common.interrupted_by_signals():  # a library may turn it into another error
             result = adaptation.adapt(
@@ -146,7 +145,7 @@ def adapt(
                 on_message=common.say,
             )
     except KeyboardInterrupt:
-        common.exit_interrupted(so_far)
+        common.exit_interrupted(f"what was made is kept in {work}; give the same command to go on")
     target = result.weights
     kept = result.is_better if locked else _is_worth_keeping(result, folder)
     if kept and not locked:

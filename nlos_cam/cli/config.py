@@ -141,7 +141,9 @@ def _checked(path: Path, name: str, value: object) -> str | int:
 
 def _is_file_of_camera(path: Path) -> bool:
     """Return True for a scene, a recording, or the folder of one of ROS 2."""
-    return path.suffix in {".toml", ".bag", ".db3", ".mcap"} or (path / ROS2_RECORD).is_file()
+    from nlos_cam.camera import full_uri  # not for the help page
+
+    return path.suffix == ".toml" or full_uri(path).startswith("bag:")
 
 
 Verbose = Annotated[

@@ -84,16 +84,9 @@ class Dataset:
         """Read the maps and images of the first `count` objects, or of all if there are fewer, and
         no shard beyond them.
         """
-        parts: list[MapSet] = []
-        rows = 0
-        for chunk in self.chunks():
-            parts.append(chunk)
-            if (rows := rows + len(chunk.image)) >= count:
-                break
+        parts = [*self.up_to(count).chunks()]
         names = (one.name for one in fields(MapSet))
-        return MapSet(
-            *(np.concatenate([getattr(part, name) for part in parts])[:count] for name in names)
-        )
+        return MapSet(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def chunks(self) -> Iterator[MapSet]:
         """Yield all maps and images in order, one shard at a time."""

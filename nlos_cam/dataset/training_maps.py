@@ -145,8 +145,8 @@ def read_maps(
     held out.
 
     To expected maps the sensor's noise is added, in each epoch another draw. A stream reads the
-    objects from disk and keeps a few shards in memory. Maps of another rig than that of the weights that a
-    transfer has as its `start` are aligned with it; expected ones are refused.
+    objects from disk and keeps a few shards in memory. Maps of another rig than that of the weights
+    that a transfer has as its `start` are aligned with it; expected ones are refused.
     """
     if wall and recipe.maps == "raw maps":
         raise SceneError(

@@ -93,7 +93,9 @@ SIMULATED = " On the simulated camera: this says nothing about a real L515."
 def verdict(analysis: Analysis) -> Banner:
     """Return the verdict, what it rests on, and that the camera was simulated where it was."""
     found = _verdict(analysis)
-    return replace(found, advice=found.advice + SIMULATED * analysis.plan.is_simulated)
+    if not analysis.plan.is_simulated:
+        return found
+    return replace(found, advice=found.advice + SIMULATED)
 
 
 def _verdict(analysis: Analysis) -> Banner:

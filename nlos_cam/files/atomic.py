@@ -75,9 +75,9 @@ def atomic_directory(out: Path, *, drop: Collection[str] = ()) -> Generator[Path
     """Yield an empty directory; on success flush it to disk and let it take the place of `out` in
     one rename.
 
-    `out` keeps its owner and permissions. Entries of it with other names stay, but for files that match a pattern of `drop`, as in
-    `fnmatch`, and folders that match one with a slash at its end: they go in the same step, or
-    after the new entries where there is no such step.
+    `out` keeps its owner and permissions. Entries of it with other names stay, but for files that
+    match a pattern of `drop`, as in `fnmatch`, and folders that match one with a slash at its end:
+    they go in the same step, or after the new entries where there is no such step.
     Raises OutputExistsError where `out` is a file, or appeared meanwhile, and FileBusyError while
     another process writes it.
     """

@@ -245,7 +245,8 @@ def describe_adaptation(folder: Path, _verify: bool) -> Description:
         "minutes": f"{minutes:g} in {count(len(stages), 'stage')}, {done} done",
         "objects": str(stages[-1]["objects"]),
     }
-    following = [f"nlos-cam adapt {shlex.quote(str(folder.parent))} --minutes {minutes:g}"]
+    bench = shlex.quote(str(folder.parent))
+    following = [f"nlos-cam adapt {bench} --minutes {minutes:g}"] if is_bench(folder.parent) else []
     if (page := folder / "adapt.html").exists():
         following.insert(0, f"open {shlex.quote(str(page))}")
     return Description("work of adapt", facts, "", "nlos-cam adapt", "", "plan", following)

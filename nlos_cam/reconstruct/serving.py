@@ -22,7 +22,7 @@ from nlos_models import (
     CheckpointRecord,
     load_record,
     shipped_folder,
-    weights_folder,
+    shipped_name,
 )
 
 from nlos_cam.objects import object_box
@@ -244,9 +244,8 @@ def shipped_iou(rig: Rig, weights: Path) -> float | None:
     """Return the silhouette IoU that can be expected of a folder of shipped weights on a rig; None
     for other weights, for those of the paper's network, and for a rig without an occluder.
     """
-    folder = weights_folder(weights)
-    names = [name for name in BENCH_WEIGHTS if shipped_folder(name) == folder]
-    return _shipped_iou(rig, names[0]) if names and rig.occluder else None
+    name = shipped_name(weights)
+    return _shipped_iou(rig, name) if name in BENCH_WEIGHTS and rig.occluder else None
 
 
 def _shipped_iou(rig: Rig, name: str) -> float:

@@ -32,6 +32,7 @@ __all__ = [
     "open_recording",
     "recorded_wall",
     "repair_recording",
+    "require_frames",
     "sidecar_path",
     "verify",
     "with_telemetry",
@@ -39,7 +40,7 @@ __all__ = [
 
 from .bag_reader import SAMPLE, BagReader
 from .capture import CaptureResult, CaptureSession, CaptureTarget, finalize
-from .export import ExportOptions, ExportResult, Format, export_recording
+from .export import ExportOptions, ExportResult, Format, export_recording, require_frames
 from .formats import is_ros2, open_recording
 from .frame_names import FRAME_GLOB, FRAME_STEM, FrameNames
 from .playback import ReplayCamera, VerifyResult, open_lidar_bag, verify

@@ -276,17 +276,17 @@ def export_recording(
             except RecordingError as error:
                 damage = str(error)
         reason = f" ({damage})" if damage else f": it has {', '.join(streams)}"
-        require_frames(written, stop, f"{bag.path} has no frame to write{reason}")
+        require_frames(written.total(), stop, f"{bag.path} has no frame to write{reason}")
     if points:
         written[POINTS] = points.written
     return ExportResult(dict(written), str(out), damage)
 
 
-def require_frames(written: Counter[str], stop: Event, problem: str) -> None:
-    """Raise for an export without a frame: KeyboardInterrupt if it was stopped before the first, so
-    that what it would replace stays, else RecordingError.
+def require_frames(count: int, stop: Event, problem: str) -> None:
+    """Raise for a result without a frame: KeyboardInterrupt if it was stopped before the first,
+    which is no fault of the recording, else RecordingError. What it would replace stays.
     """
-    if not written.total():
+    if not count:
         raise KeyboardInterrupt if stop.is_set() else RecordingError(problem)
 
 

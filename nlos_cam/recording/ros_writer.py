@@ -134,7 +134,7 @@ def export_ros2(
             path.rename(part / path.name)
         folder.rmdir()
         reason = damage and f" ({damage})"
-        require_frames(written, stop, f"{bag.path} has no frame to write{reason}")
+        require_frames(written.total(), stop, f"{bag.path} has no frame to write{reason}")
     return ExportResult(dict(written), str(out), damage)
 
 

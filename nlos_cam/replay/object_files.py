@@ -15,7 +15,7 @@ from nlos_cam.errors import RecordingError
 from nlos_cam.files import atomic_directory, read_arrays
 from nlos_cam.objects import mesh_from_depth
 from nlos_cam.reconstruct import ignore
-from nlos_cam.recording import FRAME_STEM, FrameNames
+from nlos_cam.recording import FRAME_STEM, FrameNames, require_frames
 
 OBJECT_FORMATS = ("ply", "glb", "obj", "csv", "npz", "points")
 """Suffixes of `SurfaceMesh.save`, and "points" for a .ply without faces."""
@@ -86,13 +86,9 @@ def export_objects(
             is_known = np.isfinite(uncertainty_m).any()
             files.add(int(number), arrays["depth_m"][k], uncertainty_m if is_known else None)
             on_frame(k + 1, len(numbers))
-        if not files.written and stop.is_set():
-            raise KeyboardInterrupt
-        if not files.written:
-            raise RecordingError(
-                f"{result} has no hidden surface in {_frames(len(numbers), every)}: nothing was"
-                " written"
-            )
+        frames = _frames(len(numbers), every)
+        problem = f"{result} has no hidden surface in {frames}: nothing was written"
+        require_frames(files.written, stop, problem)
     return files.written
 
 

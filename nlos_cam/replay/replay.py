@@ -13,7 +13,6 @@ from threading import Event
 import numpy as np
 
 from nlos_cam.camera import Camera
-from nlos_cam.errors import RecordingError
 from nlos_cam.files import atomic_directory
 from nlos_cam.reconstruct import (
     UNEXPLAINED,
@@ -25,7 +24,7 @@ from nlos_cam.reconstruct import (
     iterate_batched,
     verdict_limits,
 )
-from nlos_cam.recording import with_telemetry
+from nlos_cam.recording import require_frames, with_telemetry
 from nlos_cam.replay.media import FrameSampler, ReplayMedia, draw_contact_sheet
 from nlos_cam.replay.report import replay_document
 from nlos_cam.replay.results import ReplayResults
@@ -102,7 +101,8 @@ def replay_recording(
                     samples.add(result)
                     media.add(result, telemetry.celsius)
                     on_frame()
-            _require_frames(camera, results, stop)
+            missing = f"{camera.uri} has no frame with depth and infrared: record it again"
+            require_frames(len(results.numbers), stop, missing)
 
         np.savez_compressed(part / RESULT, **results.hidden_arrays(bench.rig))
         if bench.reference:
@@ -134,14 +134,3 @@ def _unexplained_empty(pipeline: Pipeline) -> float:
     """
     model = pipeline.uncertainty_model
     return verdict_limits(model).unexplained_empty if model else UNEXPLAINED
-
-
-def _require_frames(camera: Camera, results: ReplayResults, stop: Event) -> None:
-    """Raise for a replay without a frame: KeyboardInterrupt if it was stopped before the first,
-    which is no fault of the recording, else RecordingError.
-    """
-    if results.numbers:
-        return
-    if stop.is_set():
-        raise KeyboardInterrupt
-    raise RecordingError(f"{camera.uri} has no frame with depth and infrared: record it again")

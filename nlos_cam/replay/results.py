@@ -141,6 +141,7 @@ class ReplayResults:
         pitch_m = np.array([pitch_x_m, -pitch_y_m])
         return {
             **self._frame_arrays(rig),
+            "weights": np.array(self.weights, np.str_),
             "depth_m": self._depth_m.all(),
             "uncertainty_m": self._uncertainty_m.all(),
             "verdict": np.array([verdict or "" for verdict in self._verdicts], np.str_),
@@ -151,7 +152,6 @@ class ReplayResults:
             "z_near_m": box.z_near_m,
             "z_far_m": box.z_far_m,
             "check_frame_number": np.array([each.number for each in self.checks], np.int64),
-            "weights": np.array(self.weights, np.str_),
             "check_score": np.array([each.score for each in self.checks], np.float64),
         }
 

@@ -96,8 +96,8 @@ class SessionFile:
     """Writer of ten moments per second to an HTML file, in its own thread while entered.
 
     A moment that finds the queue full is skipped, or waited for with `keeps_all`. An existing file
-    is replaced by the first moment. After a kill the file lacks its last second and plays. A file that takes no more,
-    as the disk is full, says so in `problem`; leaving it then raises the error.
+    is replaced by the first moment. After a kill the file lacks its last second and plays. A file
+    that takes no more, as the disk is full, says so in `problem`; leaving it then raises the error.
     """
 
     address: str | None = None

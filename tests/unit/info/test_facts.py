@@ -180,13 +180,16 @@ def test_table_that_is_no_log_is_of_no_known_kind(tmp_path: Path) -> None:
 
 def test_work_of_adapt_has_its_minutes(tmp_path: Path) -> None:
     stages = [{"minutes": 1.0, "objects": 1000}, {"minutes": 9.0, "objects": 5000}]
-    work = tmp_path / "my bench" / "adapt"
+    work = make_bench(tmp_path / "my bench") / "adapt"
     (work / "stage-1" / "weights").mkdir(parents=True)
     (work / "plan.json").write_text(json.dumps({"rig_checksum": "bbd36036f151", "stages": stages}))
     found = described(work)
 
     assert found.facts["minutes"] == "10 in 2 stages, 1 done"
     assert found.next == [f"nlos-cam adapt '{tmp_path / 'my bench'}' --minutes 10"]
+
+    elsewhere = Path(shutil.copytree(work, tmp_path / "adapted-rig" / "adapt"))
+    assert described(elsewhere).next == []
 
 
 @pytest.mark.parametrize(
