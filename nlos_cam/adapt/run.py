@@ -408,16 +408,14 @@ def _train_network(
         objects = data.open_dataset(job.folder / OBJECTS, locked=True)
         first = objects.first(min(FIRST_OBJECTS, stage.objects))
         recipe = inputs.noise.fitted(recipe, start.normal, first)
-    store = data.open_packed_maps(
-        [job.folder / OBJECTS],
-        out.parent / PACKED,
+    options = data.StoreOptions(
         normal=start.normal,
         trained=inputs.trained,
         shards=stage.objects // data.SHARD,
         maps_rig=inputs.maps_rig,
         locked=job.locked is not None,
     )
-    with store as source:
+    with data.open_packed_maps([job.folder / OBJECTS], out.parent / PACKED, options) as source:
         record = training.record_run(
             recipe,
             out,

@@ -346,18 +346,17 @@ def direct(
     with ExitStack() as held:
         with tracked("packing maps") as on_progress:
             trained = models.load_record(models.weights_folder(weights)) if start else None
-            packed = data_sets.open_packed_maps(
-                data,
-                store or run.out / "packed",
-                start.normal if start else None,
+            options = data_sets.StoreOptions(
+                normal=start.normal if start else None,
                 trained=trained,
                 color=recipe.colour,
                 maps_rig=reconstruct.grid_of(trained) if trained else None,
                 run=f"{run.out.resolve()} ",
-                processes=pack_workers,
                 held_out=held_out_data,
                 pack_now=False,
             )
+            folder = store or run.out / "packed"
+            packed = data_sets.open_packed_maps(data, folder, options, processes=pack_workers)
             source = held.enter_context(packed)
             held_out = source.held_out(held_out_data, recipe.held_out)
             recipe = recipe.model_copy(update={"held_out": len(held_out.image)})

@@ -32,6 +32,7 @@ __all__ = [
     "RigRange",
     "RigSpread",
     "Stimulus",
+    "StoreOptions",
     "Tracked",
     "as_map_set",
     "build_dataset",
@@ -111,7 +112,7 @@ from .outliers import (
     draw_outlier,
     outliers_beside,
 )
-from .packed import PackedMaps, map_noise, open_packed_maps
+from .packed import PackedMaps, StoreOptions, map_noise, open_packed_maps
 from .packed_index import data_key
 from .plan import RECORDED, DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm

@@ -41,6 +41,7 @@ from nlos_cam.dataset.packed import (
     IMAGES,
     MAPS,
     PackedMaps,
+    StoreOptions,
     map_noise,
     open_packed_maps,
 )
@@ -495,7 +496,9 @@ def test_cells_of_weights_serve_maps_of_their_own_rig_alone(
     record: Any = SimpleNamespace(rig_checksum=PLAN.rig.checksum)
     data = _add(tmp_path / "data", 0, plan)
 
-    with open_packed_maps([data], store_folder, normal=normal, trained=record) as packed:
+    with open_packed_maps(
+        [data], store_folder, StoreOptions(normal=normal, trained=record)
+    ) as packed:
         assert torch.equal(packed.normal.median, normal.median) == kept
 
 
@@ -504,12 +507,12 @@ def test_store_with_the_cells_of_another_rig_is_refused(tmp_path: Path, store_fo
     normal.median += 7.0
     record: Any = SimpleNamespace(rig_checksum=OTHER.rig.checksum)
     data = _add(tmp_path / "data", 0, MANY)
-    with open_packed_maps([data], store_folder, normal=normal):
+    with open_packed_maps([data], store_folder, StoreOptions(normal=normal)):
         pass  # as it was filled before such cells were dropped
 
     with (
         pytest.raises(SceneError, match="other weights: name another --store"),
-        open_packed_maps([data], store_folder, normal=normal, trained=record),
+        open_packed_maps([data], store_folder, StoreOptions(normal=normal, trained=record)),
     ):
         pass
 
@@ -555,7 +558,7 @@ def test_one_rig_on_the_wall_grid_makes_weights_for_it(tmp_path: Path, store_fol
     data = _add(tmp_path / "data", 0, PLAN)
     recipe = small_recipe(task="direct", objects=4, held_out=2)
 
-    with open_packed_maps([data], store_folder, maps_rig=WALL_GRID) as packed:
+    with open_packed_maps([data], store_folder, StoreOptions(maps_rig=WALL_GRID)) as packed:
         record = packed.record_run(recipe, tmp_path / "out", [])
 
     assert (record.rig_name, record.rig_checksum) == (PLAN.rig.name, WALL_GRID.checksum)
@@ -578,7 +581,7 @@ def test_run_that_begins_anew_sees_the_objects_that_are_there(
     data = _add(tmp_path / "data", 0)
     counts: list[int] = []
     for begins_anew in (False, False, True):
-        with open_packed_maps([data], store_folder, run="one ") as packed:
+        with open_packed_maps([data], store_folder, StoreOptions(run="one ")) as packed:
             if begins_anew:
                 packed.forget_run()
             counts.append(len(_epoch(packed, 1, batch=1)[0]))
@@ -638,7 +641,7 @@ def test_maps_in_color_are_packed_with_three_intensities(
 ) -> None:
     one = _add_in_color(tmp_path / "one", COLOR)
 
-    with open_packed_maps([one], store_folder, color=True) as packed:
+    with open_packed_maps([one], store_folder, StoreOptions(color=True)) as packed:
         maps, images = _epoch(packed, 1)
         held_out = packed.held_out(_add_in_color(tmp_path / "other", COLOR, 100), 2)
 
@@ -651,7 +654,7 @@ def test_maps_in_color_of_many_rigs_are_refused(tmp_path: Path, store_folder: Pa
     many = _add_in_color(tmp_path / "many", replace(COLOR, spread=RigSpread(angle_deg=1)))
 
     with pytest.raises(SceneError, match="without a spread"):
-        open_packed_maps([many], store_folder, color=True).__enter__()
+        open_packed_maps([many], store_folder, StoreOptions(color=True)).__enter__()
 
 
 def test_new_shards_enter_new_epochs(folder: Path, store_folder: Path) -> None:
@@ -667,7 +670,7 @@ def test_new_shards_of_held_out_objects_are_refused(
 ) -> None:
     held_out = _add(tmp_path / "held-out", 100)
 
-    with open_packed_maps([folder], store_folder, held_out=held_out) as packed:
+    with open_packed_maps([folder], store_folder, StoreOptions(held_out=held_out)) as packed:
         _add(folder, 5)
         _epoch(packed, 1)
         _add(folder, 100)
@@ -709,12 +712,12 @@ def test_shard_that_grows_enters_the_next_epoch(folder: Path, store_folder: Path
 
 
 def test_another_run_in_the_same_store_sees_all_objects(folder: Path, store_folder: Path) -> None:
-    with open_packed_maps([folder], store_folder, run="one ") as packed:
+    with open_packed_maps([folder], store_folder, StoreOptions(run="one ")) as packed:
         _epoch(packed, 1, 1)
         _add(folder, 5)
-    with open_packed_maps([folder], store_folder, run="one ") as packed:
+    with open_packed_maps([folder], store_folder, StoreOptions(run="one ")) as packed:
         assert len(_epoch(packed, 1, 1)[0]) == 5
-    with open_packed_maps([folder], store_folder, run="two ") as packed:
+    with open_packed_maps([folder], store_folder, StoreOptions(run="two ")) as packed:
         assert len(_epoch(packed, 1, 1)[0]) == 10
 
 
@@ -785,12 +788,12 @@ def test_statistics_are_of_the_shards_that_the_first_epoch_sees(
     folder: Path, tmp_path: Path, store_folder: Path
 ) -> None:
     """A run that was killed before its first epoch finds more shards when it begins again."""
-    with open_packed_maps([folder], store_folder, shards=1) as packed:
+    with open_packed_maps([folder], store_folder, StoreOptions(shards=1)) as packed:
         alone = packed.digest
     _add(folder, 5)
-    with open_packed_maps([folder], tmp_path / "again", shards=1) as packed:
+    with open_packed_maps([folder], tmp_path / "again", StoreOptions(shards=1)) as packed:
         assert packed.digest == alone
-    with open_packed_maps([folder], tmp_path / "more", shards=2) as packed:
+    with open_packed_maps([folder], tmp_path / "more", StoreOptions(shards=2)) as packed:
         assert packed.digest != alone
 
 
@@ -814,7 +817,7 @@ def given(folder: Path, store_folder: Path) -> CellNormal:
     """A normalisation with which a store was made."""
     normal = CellNormal()
     normal.median += 0.5
-    with open_packed_maps([folder], store_folder, normal=normal) as packed:
+    with open_packed_maps([folder], store_folder, StoreOptions(normal=normal)) as packed:
         assert torch.equal(packed.normal.median, normal.median)
     return normal
 
@@ -829,12 +832,12 @@ def test_store_keeps_the_normalisation_of_given_weights(
 @pytest.mark.usefixtures("given")
 def test_store_of_another_normalisation_is_refused(folder: Path, store_folder: Path) -> None:
     with pytest.raises(SceneError, match="name another --store"):
-        open_packed_maps([folder], store_folder, normal=CellNormal()).__enter__()
+        open_packed_maps([folder], store_folder, StoreOptions(normal=CellNormal())).__enter__()
 
 
 def _assert_refused(store: Path, dataset: Path, words: str, **options: Any) -> None:
     with pytest.raises(SceneError, match=words) as refused:
-        open_packed_maps([dataset], store, **options).__enter__()
+        open_packed_maps([dataset], store, StoreOptions(**options)).__enter__()
 
     assert "name another --store" in str(refused.value)
     assert "\n" not in str(refused.value)
@@ -876,7 +879,7 @@ def test_store_of_other_objects_is_refused(tmp_path: Path, begun: Path) -> None:
 
 def test_store_without_a_shard_knows_its_data(tmp_path: Path, folder: Path) -> None:
     """Statistics of the cells are taken before a shard is packed."""
-    with open_packed_maps([folder], tmp_path / "store", shards=1) as packed:
+    with open_packed_maps([folder], tmp_path / "store", StoreOptions(shards=1)) as packed:
         assert len(packed) == 0
 
     _assert_refused(tmp_path / "store", _add(tmp_path / "b", 20), "other data")
