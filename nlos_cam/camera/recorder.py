@@ -9,8 +9,8 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from math import inf
 from pathlib import Path
 from shlex import quote
@@ -315,6 +315,44 @@ class _Replaced:
         self._free.clear()
 
 
+class _TakeChange:
+    """Change from one take's file to the next between two sets, which the SDK's thread delivers."""
+
+    def __init__(self) -> None:
+        self._asked = Event()
+        """Set while the file is to be replaced, or is being replaced."""
+        self._at_boundary = Event()
+        """Set once the SDK's thread waits between two sets: now the file may be replaced."""
+        self._over = Event()
+        """Set when the file is replaced: the SDK's thread may go on."""
+
+    @property
+    def is_asked(self) -> bool:
+        """True while a change is under way: the SDK's thread must `wait`, and record nothing."""
+        return self._asked.is_set()
+
+    def wait(self) -> None:
+        """Hold the SDK's thread between two sets until the change is over."""
+        self._at_boundary.set()
+        self._over.wait(BOUNDARY_WAIT_S)
+
+    @contextmanager
+    def between_sets(self) -> Generator[None]:
+        """Run a block while the SDK's thread is held between two sets: none is cut in two.
+
+        A device that delivers nothing is not waited for.
+        """
+        self._at_boundary.clear()
+        self._over.clear()
+        self._asked.set()
+        self._at_boundary.wait(BOUNDARY_WAIT_S)
+        try:
+            yield
+        finally:
+            self._asked.clear()
+            self._over.set()
+
+
 class Recording:
     """Recording of a camera to `path`, up to a number of `frames` or `seconds`, if given.
 
@@ -379,12 +417,8 @@ class Recording:
         """Set by `stop`: the take ends with the next set."""
         self._paused = Event()
         """Set once no more is recorded in this take."""
-        self._changing = Event()
-        """Set by `next_take` while it replaces the file: `add` records nothing."""
-        self._at_boundary = Event()
-        """Set by `add` when it has seen that, between two sets: now the file may be replaced."""
-        self._changed = Event()
-        """Set by `next_take` when the file is replaced: `add` may let the SDK go on."""
+        self._change = _TakeChange()
+        """The change to the next take."""
 
     def begin(self, device: Any, sdk: Any) -> None:
         """Record the device's streams.
@@ -445,22 +479,16 @@ class Recording:
 
         Raises RecordingError where nothing can be written.
         """
-        self._at_boundary.clear()
-        self._changed.clear()
-        self._changing.set()
-        # `add` holds the SDK's thread there: no set is cut in two.
-        self._at_boundary.wait(BOUNDARY_WAIT_S)
-        self.path = path
-        self.sets = 0
-        self.started = False
-        self._last = last
-        try:
-            self.begin(*self._source)
-        finally:
-            self._stopping.clear()
-            self._paused.clear()
-            self._changing.clear()
-            self._changed.set()
+        with self._change.between_sets():
+            self.path = path
+            self.sets = 0
+            self.started = False
+            self._last = last
+            try:
+                self.begin(*self._source)
+            finally:
+                self._stopping.clear()
+                self._paused.clear()
 
     def add(self, found: FrameSet, arrived_s: float) -> bool:
         """Count a passing set, on an SDK thread; return True once no more is recorded, in this or a
@@ -468,10 +496,9 @@ class Recording:
 
         `arrived_s` is on a clock that does not jump.
         """
-        if self._changing.is_set():
+        if self._change.is_asked:
             self._before_s = found.timestamp_s
-            self._at_boundary.set()
-            self._changed.wait(BOUNDARY_WAIT_S)
+            self._change.wait()
             return False
         if self._recorder and not self._paused.is_set():
             self._count(found, arrived_s, self._recorder)

@@ -27,6 +27,8 @@ from nlos_cam.errors import OutputExistsError
 from nlos_cam.files import checksums_of
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from nlos_cam.frames import LidarMaps
 
 PAGE = "adapt.html"
@@ -153,36 +155,49 @@ def adapt(
     with common.interrupted_by_signals(f"the weights are in {target}; the page is not written"):
         expected = None if locked else _forecast(rig, folder)
     name = shlex.quote(bench)
-    more = f"nlos-cam adapt {name} --minutes {min(2 * result.plan.minutes, MAX_MINUTES):g}"
     place = f"{'--bench' if own else '--rig'} {name}"
-    commands = [f"nlos-cam evaluate {place} --weights {shlex.quote(str(target))}"]
+    pictures = (
+        cameras.pictures_command(measured.record, place)
+        if measured
+        else f"nlos-cam live --camera l515 {place}"
+    )
     if locked:
-        commands = []
-        more += f" --frames {locked.frames} --radiometry {locked.radiometry}"
-        more += f" --pulse-ns {sensor.pulse_ns:g} --material {material or 'matt'}"
-    if folder and not locked:
-        pictures = (
-            cameras.pictures_command(measured.record, place)
-            if measured
-            else f"nlos-cam live --camera l515 {place}"
-        )
-        if kept:
-            commands = [pictures]
-        elif _has_weights_of_another_rig(folder):
-            commands = [f"{pictures} --weights {shlex.quote(_better_weights(result, rig))}"]
-    # the pace that the plan was made with is that of these
-    machines: dict[str, Any] = {
-        "--out": out,
-        "--weights": weights,
-        "--ray": ray,
-        "--backend": backend if backend != "cpu" else None,
-        "--workers": workers,
-        "--accelerator": accelerator if accelerator != "auto" else None,
-    }
-    for option, value in machines.items():
-        more += f" {option} {shlex.quote(str(value))}" if value is not None else ""
-    commands.append(more)
-    _report(result, target, commands, work / PAGE, expected, kept=kept, as_json=json)
+        use = []
+    elif folder and kept:
+        use = [pictures]
+    elif folder and _has_weights_of_another_rig(folder):
+        use = [f"{pictures} --weights {shlex.quote(_better_weights(result, rig))}"]
+    else:
+        use = [f"nlos-cam evaluate {place} --weights {shlex.quote(str(target))}"]
+    more = _go_on_command(
+        name,
+        min(2 * result.plan.minutes, MAX_MINUTES),
+        {
+            "--frames": locked and locked.frames,
+            "--radiometry": locked and locked.radiometry,
+            "--pulse-ns": f"{sensor.pulse_ns:g}" if locked else None,
+            "--material": (material or "matt") if locked else None,
+            "--out": out,
+            "--weights": weights,
+            # the pace that the plan was made with is that of these
+            "--ray": ray,
+            "--backend": backend if backend != "cpu" else None,
+            "--workers": workers,
+            "--accelerator": accelerator if accelerator != "auto" else None,
+        },
+    )
+    _report(result, target, [*use, more], work / PAGE, expected, kept=kept, as_json=json)
+
+
+def _go_on_command(bench: str, minutes: float, options: Mapping[str, Any]) -> str:
+    """Return the command that goes on with more minutes, with the options that have a value."""
+    words = [f"nlos-cam adapt {bench} --minutes {minutes:g}"]
+    words += [
+        f"{option} {shlex.quote(str(value))}"
+        for option, value in options.items()
+        if value is not None
+    ]
+    return " ".join(words)
 
 
 def _forecast(rig: walls.Rig, folder: Path | None) -> benches.ForecastRecord:

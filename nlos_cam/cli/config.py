@@ -176,20 +176,15 @@ def shared_options(name: str, command: Callable[..., None]) -> Callable[..., Non
 
     @wraps(command)
     def run(**values: Any) -> None:
-        verbose = values.pop("verbose")
-        quiet = values.pop("quiet")
-        if verbose and quiet:
-            raise typer.BadParameter("--verbose and --quiet contradict each other: give one")
-        set_detail(verbose=verbose, quiet=quiet)
+        _take_detail(values)
         settings = read_settings()
         used = {key: value for key, value in settings.items() if name in SETTINGS[key].commands}
-        named = (
-            _choose_camera(values, used, may_be_folder=name == "detect") if takes_camera else True
-        )
+        is_named = not takes_camera or _choose_camera(values, used, may_be_folder=name == "detect")
         _choose_bench(values, used)
         _fill(values, used)
-        if not named:
+        if not is_named:
             _take_default_camera(values)
+
         try:
             with _cache_at(settings["cache"]) if name != "config" else nullcontext():
                 command(**values)
@@ -201,6 +196,15 @@ def shared_options(name: str, command: Callable[..., None]) -> Callable[..., Non
     run.__annotations__ = {each.name: each.annotation for each in parameters}
     run.__dict__["__signature__"] = inspect.Signature(parameters)
     return run
+
+
+def _take_detail(values: dict[str, Any]) -> None:
+    """Set how much is printed, by the two options of all commands."""
+    verbose = values.pop("verbose")
+    quiet = values.pop("quiet")
+    if verbose and quiet:
+        raise typer.BadParameter("--verbose and --quiet contradict each other: give one")
+    set_detail(verbose=verbose, quiet=quiet)
 
 
 @contextmanager

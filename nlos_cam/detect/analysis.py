@@ -359,21 +359,20 @@ def _finding(group: Group, number: int, scale: Scale, smallest: Float64) -> Find
 def smallest_in_noises(group: Group, number: int, scale: Scale) -> float:
     """Return the effect in one patch, in noises of one block, that is found with a probability of
     POWER; the group is one without effect.
+
+    By injection: values of random cells under random signs are draws of the noise. An effect is
+    added, and the whole test is run again on those cells; the others keep their largest value,
+    which is that of a random pattern.
     """
-    # By injection: values of random cells under random signs are draws of the noise. An effect
-    # is added, and the whole test is run again on those cells; the others keep their largest value,
-    # which is that of a random pattern. An effect that fills a patch also lies in the patches that
-    # overlap with it, which compete with it under flipped signs.
     generator = np.random.default_rng(POWER_SEED)
     blocks = len(group.values)
-    rest = group.values / group.noise
+    # An effect that fills a patch also lies in the patches that overlap with it, which compete with
+    # it under flipped signs.
     cells, share = _overlapping(group, generator)
-    draws = rest[:, cells] * generator.choice([-1.0, 1.0], (blocks, len(cells), 1))
-    patterns = np.arange(len(scale.family))
-    wanted = max(POWER_PATTERNS, ceil(POWER_LARGER / scale.alpha))
-    if len(patterns) > wanted:
-        drawn = generator.choice(patterns[1:], wanted - 1, replace=False)
-        patterns = np.concatenate([[0], drawn])
+    noise = (group.values / group.noise)[:, cells]
+    draws = noise * generator.choice([-1.0, 1.0], (blocks, len(cells), 1))
+
+    patterns = _some_patterns(scale, generator)
     signs = sign_patterns(blocks)[patterns]
     others = np.stack(
         [generator.permutation(scale.family)[: len(patterns)] for _ in range(len(cells))], axis=1
@@ -385,8 +384,28 @@ def smallest_in_noises(group: Group, number: int, scale: Scale) -> float:
         scores = np.abs(signs @ flat) / (moderate(flat, np.ones(flat.shape[1])) * sqrt(blocks))
         own = scores.reshape(len(signs), *cells.shape).max(axis=2)
         highest = np.maximum((own - scale.middle[number]) / scale.spread[number], others)
-        return float(np.mean(np.mean(highest >= highest[0], axis=0) <= scale.alpha))
+        p_values = np.mean(highest >= highest[0], axis=0)
+        return float(np.mean(p_values <= scale.alpha))
 
+    return _smallest_of_power(power)
+
+
+def _some_patterns(scale: Scale, generator: np.random.Generator) -> NDArray[np.int64]:
+    """Return the numbers of sign patterns that are enough for p-values near alpha: the observed
+    one, 0, and others at random.
+    """
+    patterns = np.arange(len(scale.family))
+    wanted = max(POWER_PATTERNS, ceil(POWER_LARGER / scale.alpha))
+    if len(patterns) <= wanted:
+        return patterns
+    drawn = generator.choice(patterns[1:], wanted - 1, replace=False)
+    return np.concatenate([[0], drawn])
+
+
+def _smallest_of_power(power: Callable[[float], float]) -> float:
+    """Return the smallest effect that a rising function gives a probability of POWER; infinity
+    beyond MAX_NOISES.
+    """
     low = 0.0
     high = 1.0
     while power(high) < POWER:

@@ -17,7 +17,9 @@ from nlos_cam.files import TEXT_LIMIT, atomic_file, read_bounded
 PLAN = "detection.json"
 TURNS = "turn-*.npz"
 REPORT = "detection.html"
-ASKED = ("turns", "frames", "alpha", "control")
+NUMBERS = ("turns", "frames", "alpha")
+"""Fields of the plan whose values say what differs."""
+ASKED = (*NUMBERS, "control")
 """Fields of the plan that a command gives by itself, before a camera is open."""
 TOGETHER = (*ASKED, "serial", "settings", "rig")
 """Fields of the plan that a command must repeat in order to go on with a session."""
@@ -85,8 +87,7 @@ class Session:
         for name in names:
             before, asked = getattr(self.plan, name), getattr(plan, name)
             if before != asked:
-                is_number = name in ASKED and name != "control"
-                values = f" ({before}, not {asked})" if is_number else ""
+                values = f" ({before}, not {asked})" if name in NUMBERS else ""
                 raise RecordingError(
                     f"{self.folder} was begun with another {name}{values}: repeat that command, or"
                     " choose another folder (a plan that changes midway has no false-alarm rate)"

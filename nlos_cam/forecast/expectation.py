@@ -284,19 +284,28 @@ def _by_material(
     box = object_box(rig)
     span_m = box.z_far_m - box.z_near_m
     in_room = [echoes_of(rig, shape, sensor, "lambertian", MATERIAL_NAMES) for shape in shapes]
+    matt_echoes = [one["matt"] for one in echoes]
+    references = [
+        expectation(
+            base.conditions,
+            posteriors(shapes, matt_echoes, base.conditions.frames),
+            matt_echoes,
+            span_m,
+        )
+        for base in matt
+    ]
     rows: list[Expectation] = []
     for light, name in product(get_args(Radiometry), MATERIAL_NAMES):
         if (light, name) == ("paper", "matt"):
             continue
         now = [one[name] for one in (echoes if light == "paper" else in_room)]
-        for i, base in enumerate(matt):
+        is_lit = any(one.light.size for one in now)
+        for i, (base, reference) in enumerate(zip(matt, references, strict=True)):
             frames = base.conditions.frames
             conditions = Conditions(frames, name, light)
-            if not any(one.light.size for one in now):
+            if not is_lit:
                 rows.append(replace(guess, conditions=conditions))
                 continue
-            own = [one["matt"] for one in echoes]
-            reference = expectation(base.conditions, posteriors(shapes, own, frames), own, span_m)
             row = expectation(conditions, posteriors(shapes, now, frames), now, span_m)
             row = _as_far_from(base, reference, row)
             rows.append(at_least(row, rows[-1]) if i else row)

@@ -323,20 +323,18 @@ class _Run:
         """Put the averaged weights into the module, if there are any; put its own back
         afterwards.
         """
-        self._swap()
+        self._exchange_with_average()
         try:
             yield
         finally:
-            self._swap()
+            self._exchange_with_average()
 
-    def _swap(self) -> None:
+    def _exchange_with_average(self) -> None:
+        """Exchange the module's weights and the average's: pointers, no memory is copied."""
         if not self.average:
             return
         for own, average in zip(self._free, self.average, strict=True):
-            # Pointers are exchanged, no memory is copied.
-            trained = own.data
-            own.data = average.data
-            average.data = trained
+            own.data, average.data = average.data, own.data
 
     def log_minute(self) -> None:
         """Append a line to MINUTES: steps done, rate, mean loss of the epoch so far, samples per
@@ -385,7 +383,7 @@ class _Run:
         # Averaged weights are what is handed on; the run's own stay in the last state, for a
         # resume.
         row = self.rows[-1]
-        self._swap()
+        self._exchange_with_average()
         if self.recipe.keep == "best":
             self.fabric.barrier()  # the leader may still be writing it
             best = read_best(self.folder)
