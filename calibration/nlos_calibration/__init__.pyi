@@ -93,6 +93,7 @@ __all__ = [
     "with_base",
     "with_degrees",
     "with_mm",
+    "with_object_box",
     "with_occluder",
     "with_range_offset",
 ]
@@ -182,5 +183,6 @@ from .wall_record import (
     rig_named,
     wall_from_zero,
     wall_points_m,
+    with_object_box,
     with_occluder,
 )

@@ -279,10 +279,10 @@ def _by_board(plane: UncertainPlane, refusal: WallRefusedError) -> WallByBoard:
 def _by_both(depth: WallFit, both: Combined) -> WallFit:
     """Return the depth's wall with the combined plane, and the verdict on both."""
     measures = measures_of(both.plane.slopes, both.plane.covariance)
-    problems = out_of_range(measures.distance_m, measures.facing_deg)
     verdict = depth.verdict
     advice = depth.advice
     if both.causes:
+        problems = out_of_range(measures.distance_m, measures.facing_deg)
         apart = both.disagreement
         conflict = (
             f"depth and board disagree by {1e3 * apart.distance_m:+.1f} mm and"
@@ -292,8 +292,9 @@ def _by_both(depth: WallFit, both: Combined) -> WallFit:
         verdict = "doubtful"
         advice = "; ".join([conflict, *problems])
     elif verdict != "doubtful":
-        verdict = "out of range" if problems else "good"
-        advice = "; ".join(problems) or f"{depth.advice}; depth and board agree"
+        verdict, advice = range_verdict(measures.distance_m, measures.facing_deg)
+        if verdict == "good":
+            advice = f"{advice}; depth and board agree"
     pose = wall_from_plane(both.plane.normal, both.plane.distance_m)
     fitted = replace(
         depth, **vars(measures), wall_from_lidar=pose, covariance=both.plane.covariance

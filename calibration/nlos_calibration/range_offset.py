@@ -29,7 +29,7 @@ from nlos_calibration.errors import CalibrationError, WallRefusedError
 from nlos_calibration.flatness import SURE_SIGMAS
 from nlos_calibration.geometry import Intrinsics, plane_gradients
 from nlos_calibration.noise import depth_noise_m
-from nlos_calibration.wall import WallFit
+from nlos_calibration.wall import MEASURE_BY_TAPE, WallFit
 
 # A ruled millimetre is read to half of it.
 TAPE_STD_M = 0.0005
@@ -40,6 +40,8 @@ SEARCHED_M = 0.15
 """Larger offsets are not looked for where the depth as read is no wall."""
 SEARCH_STEP_M = 0.01
 """An offset known to this leaves a wall that is not refused."""
+FIRST_STEP_M = 0.002
+"""Largest first step of the search for the offset of a wall that is not refused."""
 AGREED_M = 1e-6
 MAX_STEPS = 8
 
@@ -91,6 +93,15 @@ def fit_with_tape_distance(
     Raises CalibrationError where tape and lidar cannot both be right, and names the offset where
     the depth is that of a bare wall but for it; WallRefusedError where it is of no bare wall.
     """
+    taped = _fit_with_tape_distance(fit_with, tape_m, fit_along_rays)
+    fit = taped.fit
+    measured = f"the tape's offset is {1e3 * taped.offset_m:+.1f} mm: measure the distance again"
+    return replace(taped, fit=replace(fit, advice=fit.advice.replace(MEASURE_BY_TAPE, measured)))
+
+
+def _fit_with_tape_distance(
+    fit_with: FitWith, tape_m: float, fit_along_rays: FitAlongRays | None
+) -> CorrectedWall:
     # an origin that moves back along the optical axis moves away from the wall by cos(facing) of
     # that: exact. A depth offset also bends an oblique wall, so its effect on the distance is found
     # numerically.
@@ -107,6 +118,14 @@ def fit_with_tape_distance(
         if not (found or along):
             raise
         raise _named(found, along, tape_m) from None
+    corrected = _corrected(fit_with, plain, tape_m, TAPE_STD_M)
+    # Both fits have the same noise, and a wall faced squarely shows no more than that: the halves'
+    # bends then differ by chance, and the depth stays as it was read.
+    if corrected and abs(corrected.offset_m) <= MAX_OFFSET_M:
+        flatter_deg = plain.bend_deg - corrected.fit.bend_deg
+        if flatter_deg > SURE_SIGMAS * plain.bend_std_deg:
+            return corrected
+
     axis_share = cos(radians(plain.facing_deg))
     origin_m = (tape_m - plain.distance_m) / axis_share
     if abs(origin_m) > MAX_OFFSET_M:
@@ -115,14 +134,7 @@ def fit_with_tape_distance(
             f" an offset of {abs(origin_m) * 1e3:.0f} mm ({MAX_OFFSET_M * 1e3:.0f} mm allowed):"
             " measure from the front glass to the wall, along the wall's normal"
         )
-    moved = _with_offset(fit_with(0.0, origin_m), origin_m, axis_share, TAPE_STD_M, "origin")
-    corrected = _corrected(fit_with, plain, origin_m, tape_m, TAPE_STD_M)
-    # Both fits have the same noise, and a wall faced squarely shows no more than that: the halves'
-    # bends then differ by chance, and the depth stays as it was read.
-    if corrected is None:
-        return moved
-    flatter_deg = plain.bend_deg - corrected.fit.bend_deg
-    return corrected if flatter_deg > SURE_SIGMAS * plain.bend_std_deg else moved
+    return _with_offset(fit_with(0.0, origin_m), origin_m, axis_share, TAPE_STD_M, "origin")
 
 
 def fit_with_board_distance(
@@ -137,8 +149,7 @@ def fit_with_board_distance(
     except WallRefusedError:
         found = _searched(lambda offset_m: fit_with(offset_m, 0.0), board_m, board_std_m)
     else:
-        missing_m = board_m - plain.distance_m
-        found = _corrected(fit_with, plain, missing_m, board_m, board_std_m)
+        found = _corrected(fit_with, plain, board_m, board_std_m)
         if found and found.fit.bend_deg >= plain.bend_deg:
             return None
     return found if found and abs(found.offset_m) <= MAX_OFFSET_M else None
@@ -159,13 +170,11 @@ def _searched(
             start = fit_with(offset_m)
         except WallRefusedError:
             continue
-        missing_m = distance_m - start.distance_m
-        if abs(missing_m) > SEARCH_STEP_M:
+        if abs(distance_m - start.distance_m) > SEARCH_STEP_M:
             continue
         found = _corrected(
             lambda added_m, _origin_m, at_m=offset_m: fit_with(at_m + added_m),
             start,
-            missing_m,
             distance_m,
             std_m,
         )
@@ -190,11 +199,14 @@ def _named(
 
 
 def _corrected(
-    fit_with: FitWith, plain: WallFit, offset_m: float, distance_m: float, std_m: float
+    fit_with: FitWith, plain: WallFit, distance_m: float, std_m: float
 ) -> CorrectedWall | None:
-    """Solve distance(offset) = distance_m by the secant method, from a first `offset_m` on; None
+    """Solve distance(offset) = distance_m by the secant method, from the wall of no offset on; None
     where no correction leaves a wall there.
     """
+    # The effect of an offset is known by the first step only: a long one could leave no wall.
+    missing_m = distance_m - plain.distance_m
+    offset_m = float(np.clip(missing_m, -FIRST_STEP_M, FIRST_STEP_M))
     before = plain
     step_m = offset_m
     for _ in range(MAX_STEPS):

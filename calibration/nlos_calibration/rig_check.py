@@ -314,6 +314,10 @@ def _area(corners: Float64) -> float:
 GAP_RANGE_M = 0.05, 0.20
 """The paper's (SI 1): less lets too little light through, more lets the lidar see the object."""
 PAPER_X_M = 0.20
+MIN_PLACE_M = 0.05
+"""Beginning of an object box that leaves an occluder room before it."""
+CLEAR_M = 0.01
+"""Distance to the box that the occluder is advised to have at least."""
 WARN_TILT_DEG = 2.0
 MIN_SHARE = 0.55
 """Share of the map's cells on the wall. The paper's rig has 57 % in its worst pose: 75 degrees,
@@ -392,12 +396,10 @@ def _occluder_position(
             f"{name} has a gap of {gap_m:.3f} m, {needed}: move it {by_cm} cm {way} the wall"
         )
     if not _between(occluder, box):
-        way = "away from" if occluder.x_m < PAPER_X_M else "towards"
-        by_cm = at_least(100.0 * abs(occluder.x_m - PAPER_X_M))
         ends = f"the lidar at 0 and the object{f' from {box.x_min_m:.3f} m on' if box else ''}"
         problems.append(
-            f"{name} stands at x = {occluder.x_m:.3f} m, not between {ends}: move it {by_cm} cm"
-            f" {way} the lidar, to the paper's {PAPER_X_M:.2f} m"
+            f"{name} stands at x = {occluder.x_m:.3f} m, not between {ends}:"
+            f" {_move_between(occluder, box)}"
         )
     if abs(tilt_deg) > WARN_TILT_DEG:
         way = "towards the lidar" if tilt_deg > 0.0 else "away from the lidar"
@@ -405,6 +407,18 @@ def _occluder_position(
             f"{name} leans by {tilt_deg:+.1f} degrees, 0 assumed: tilt its upper end back {way}"
         )
     return problems
+
+
+def _move_between(occluder: Occluder, box: ObjectBox | None) -> str:
+    """Return what to move so that the occluder stands between lidar and object."""
+    if box and box.x_min_m < MIN_PLACE_M:
+        by_cm = at_least(100.0 * (PAPER_X_M - box.x_min_m))
+        return f"move the object {by_cm} cm away from the lidar, along the wall"
+    place_m = min(PAPER_X_M, box.x_min_m - CLEAR_M) if box else PAPER_X_M
+    way = "away from" if occluder.x_m < place_m else "towards"
+    by_cm = at_least(100.0 * abs(occluder.x_m - place_m))
+    papers = "the paper's " if place_m == PAPER_X_M else ""
+    return f"move it {by_cm} cm {way} the lidar, to {papers}{place_m:.2f} m"
 
 
 def _between(occluder: Occluder | None, box: ObjectBox | None) -> bool:

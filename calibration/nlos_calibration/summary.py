@@ -74,8 +74,8 @@ def _way_up_row(record: WallRecord) -> Row:
         roll = roll_deg(record.gravity_m_s2)
         return "camera", record.way_up, f"by gravity: rolled by {roll:+z.1f}° about its axis"
     if record.way_up == "unknown":
-        return "camera", "upright?", "not known: it has no accelerometer, and nobody was asked"
-    return "camera", record.way_up, "as its owner said: it has no accelerometer"
+        return "camera", "upright?", "not known: gravity was not measured, and nobody was asked"
+    return "camera", record.way_up, "as its owner said: gravity was not measured"
 
 
 def board_agreement(board: BoardRecord, range_offset_m: float = 0.0) -> str:

@@ -33,6 +33,7 @@ TOLERANCE_DEG = 0.2
 """Tolerated error: a wall on the edge of a range is inside, a smaller shift by a bend is
 ignored.
 """
+MEASURE_BY_TAPE = "measure the distance with a tape and give it with --tape-m"
 DOUBTFUL_TOLERANCES = 0.7
 REFUSED_TOLERANCES = 5.0
 """Difference between half of the view and the whole, in tolerances. From the second on (5 mm or 1
@@ -118,7 +119,7 @@ def _reason_to_doubt(flat: Flatness, ripple_m: float) -> str:
     if bent and _explained_by_offset(flat):
         return (
             f"a range offset of {1e3 * flat.offset_m:+.1f} mm would make the wall flat (or the"
-            " wall is curved): measure the distance with a tape and give it with --tape-m"
+            f" wall is curved): {MEASURE_BY_TAPE}"
         )
     if ripple_m > DOUBTFUL_RIPPLE_M:
         return (

@@ -23,6 +23,7 @@ from nlos_calibration.rig import (
     Finite,
     LidarPose,
     NotNegative,
+    ObjectBox,
     OccluderRecord,
     PinholeRecord,
     Positive,
@@ -215,6 +216,17 @@ def with_occluder(record: WallRecord, fit: OccluderFit) -> WallRecord:
     of_wall = [one for one in record.warnings if one not in former]
     changed |= {"warnings": tuple(dict.fromkeys((*of_wall, *fit.warnings)))}
     return WallRecord.model_validate(record.model_dump() | changed)
+
+
+def with_object_box(record: WallRecord, box: ObjectBox | None) -> WallRecord:
+    """Return the record of a bench whose object box is another, and the verdict on that bench."""
+    if box == record.rig.object_box:
+        return record
+    rig = record.rig.model_copy(update={"object_box": box})
+    view = footprint(np.array(record.wall_from_lidar), rig.pinhole, rig.wall)
+    problems = judge_rig(rig, view, record.occluder)
+    verdict, advice = combined(*_of_wall_alone(record), problems)
+    return record.model_copy(update={"rig": rig, "verdict": verdict, "advice": advice})
 
 
 def _of_wall_alone(record: WallRecord) -> tuple[Verdict, str]:

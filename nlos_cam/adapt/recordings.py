@@ -16,6 +16,7 @@ from nlos_models import training
 from nlos_cam import dataset as data
 from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.files import read_toml
+from nlos_cam.objects import TRUTH_SUFFIX
 from nlos_cam.reconstruct import differences_of
 from nlos_cam.recording import load_sidecar, sidecar_path
 
@@ -153,7 +154,7 @@ def _digest_of(folder: Path) -> str:
 def _meshes_elsewhere(files: Sequence[Path]) -> Iterator[Path]:
     """Yield the meshes in other folders that truth files name."""
     for path in files:
-        if not path.name.endswith(data.TRUTH_SUFFIX):
+        if not path.name.endswith(TRUTH_SUFFIX):
             continue
         try:
             mesh = (path.parent / str(read_toml(path).get("file", ""))).resolve()

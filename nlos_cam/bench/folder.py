@@ -207,5 +207,4 @@ def _measured(folder: Path, record: BenchRecord, station: StationRecord) -> wall
 
 
 def _with_box(measured: walls.MeasuredWall, box: walls.ObjectBox | None) -> walls.MeasuredWall:
-    rig = measured.record.rig.model_copy(update={"object_box": box})
-    return replace(measured, record=measured.record.model_copy(update={"rig": rig}))
+    return replace(measured, record=walls.with_object_box(measured.record, box))

@@ -189,6 +189,8 @@ def measure_by_depth(
 
     taped = walls.fit_with_tape_distance(partial(_fit_depth, capture), tape_m, fit_along_rays)
     fit = taped.fit
+    if taped.cause == "depth":
+        _raise_if_disturbed(capture, offset_m=taped.offset_m)
     off_m = abs(taped.offset_m)
     if off_m > USUAL_OFFSET_M and fit.verdict != "doubtful":
         advice = (
@@ -206,6 +208,7 @@ def _fit_with_known_offset(
     uncertain too; return the fit and the record's range-offset fields.
     """
     offset_m = walls.depth_offset_m(known)
+    _raise_if_disturbed(capture, offset_m=offset_m)
     fit = _fit_depth(capture, offset_m, known.range_offset_m - offset_m)
     # an origin that moves along the optical axis moves away from the wall by the cosine of that
     per_offset = cos(radians(fit.facing_deg))
@@ -265,6 +268,7 @@ def measure_by_board(
         )
         agreed = walls.with_range_offset(fit, depth, corrected) if corrected else None
         if corrected and agreed:
+            _raise_if_disturbed(capture, offset_m=corrected.offset_m)
             if agreed.verdict != "doubtful":
                 record = record.model_copy(update={"causes": ()})
             return agreed, {"board": record, **_offset_fields(corrected)}
@@ -326,7 +330,7 @@ def measure_occluder(
     off_m = np.abs(walls.points_m(record, depth_m - offset_m, capture.intrinsics)[..., 2])
     beside = np.where((off_m < NEAR_WALL_M) & ~found.pixels, depth_m, np.nan)
     wall = fit_beside(beside)
-    _raise_if_disturbed(capture, np.isfinite(beside))
+    _raise_if_disturbed(capture, np.isfinite(beside), offset_m)
     if bare.reference is None:
         _raise_if_moved(record, wall)
     else:
@@ -379,17 +383,21 @@ def _raise_if_moved(then: walls.WallRecord | walls.WallFit, wall: walls.WallFit)
 
 
 def _raise_if_disturbed(
-    capture: CaptureStatistics, of_wall: NDArray[np.bool_] | None = None
+    capture: CaptureStatistics,
+    of_wall: NDArray[np.bool_] | None = None,
+    offset_m: float = 0.0,
 ) -> None:
     """Raise WallRefusedError if the lidar moved while the capture was taken; `of_wall` (height,
     width) are the pixels of the wall where it does not fill the view.
+
+    A part that is no wall tells nothing, as with a range offset: check again once that is known.
     """
     everywhere = np.ones((capture.intrinsics.height, capture.intrinsics.width), bool)
     seen, few = thinned(everywhere if of_wall is None else of_wall, capture.intrinsics)
     fits: list[walls.WallFit] = []
     for part_m in capture.parts_m:
-        with suppress(WallRefusedError):  # the whole capture's own refusal says why
-            wall_m = np.where(seen, part_m, np.nan)
+        with suppress(WallRefusedError):
+            wall_m = np.where(seen, part_m + offset_m, np.nan)
             fits.append(walls.fit_wall(wall_m, few, np.random.default_rng(0)))
     for later in fits[1:]:
         if moved := _how_moved(fits[0], later):

@@ -180,7 +180,7 @@ def way_up(record: walls.WallRecord) -> str:
     if record.way_up == "unknown":
         return "The camera looks steeply up or down, so that no side of its pictures is up."
     if record.gravity_m_s2 is None:
-        text = f"The camera is {record.way_up}, as its owner said: it has no accelerometer."
+        text = f"The camera is {record.way_up}, as its owner said: gravity was not measured."
     else:
         roll = walls.roll_deg(record.gravity_m_s2)
         text = (

@@ -8,6 +8,7 @@ __all__ = [
     "QUEUED_SETS",
     "RESERVE_BYTES",
     "SAME_INSTANT_S",
+    "SCHEMES",
     "SIDECAR_SUFFIX",
     "SIMULATED",
     "SIMULATED_SERIAL",
@@ -67,6 +68,7 @@ from .recorder import (
 from .registry import (
     NAMES,
     PLAIN_NAMES,
+    SCHEMES,
     SIMULATED,
     camera_to_name,
     full_uri,

@@ -21,6 +21,8 @@ SIMULATED = {
 """Packaged simulated worlds and their descriptions."""
 PLAYBACK = "nlos_cam.recording.playback"
 """Module of `ReplayCamera`, by name: it stands in a layer above this one."""
+SCHEMES = ("bag", "sim", "l515")
+"""Beginnings of cameras' names, before a colon."""
 PLAIN_NAMES = frozenset({"l515", "sim"})
 """Names of cameras that a folder may happen to have too."""
 PACKAGED_RECORDING = "sample"
@@ -83,7 +85,8 @@ def full_uri(uri: str | Path) -> str:
     if uri == PACKAGED_RECORDING:
         return f"bag:{uri}"
     is_path = uri.endswith((".bag", ".db3", ".mcap")) or (Path(uri) / "metadata.yaml").is_file()
-    return f"bag:{uri}" if is_path and not uri.startswith(("bag:", "sim:", "l515:")) else uri
+    has_scheme = uri.startswith(tuple(f"{scheme}:" for scheme in SCHEMES))
+    return f"bag:{uri}" if is_path and not has_scheme else uri
 
 
 def camera_to_name(wall: WallRecord) -> str:

@@ -474,9 +474,10 @@ def _source(
         raise typer.BadParameter(
             "choose what to measure: --wall, or --occluder wall.toml once the wall is measured"
         )
-    if bag is not None and watch:
+    is_recording = bag is not None or cameras.full_uri(camera or "").startswith("bag:")
+    if is_recording and watch:
         raise typer.BadParameter(
-            "--watch is for a lidar that can still be moved: drop it, or --bag"
+            "--watch is for a lidar that can still be moved, not for a recording: drop it"
         )
     if bag is not None and camera is None:
         return f"bag:{bag}"

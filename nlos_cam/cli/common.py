@@ -74,13 +74,18 @@ def printable(text: str) -> str:
 
 
 class PlainConsole(Console):
-    """Console that obeys no control characters in the texts it prints."""
+    """Console that changes nothing in the texts it prints, and obeys no control characters in
+    them.
+    """
+
+    def __init__(self, *, stderr: bool = False) -> None:
+        super().__init__(stderr=stderr, highlight=False, emoji=False)
 
     def render_str(self, text: str, **options: Any) -> Text:
         return super().render_str(printable(text), **options)
 
 
-stderr = PlainConsole(stderr=True, highlight=False, emoji=False)
+stderr = PlainConsole(stderr=True)
 _outputs = ExitStack()
 _reserved: list[Path] = []
 """Reserved output paths of the command that runs, and their reservations."""
@@ -176,14 +181,14 @@ def finish(
     if as_json:
         print(json_module.dumps(result), flush=True)  # noqa: T201  stdout is the machine's
     else:
-        PlainConsole(highlight=False).print(text, soft_wrap=True, markup=marked)
+        PlainConsole().print(text, soft_wrap=True, markup=marked)
 
 
 def show(table: Table, *, narrow_columns: int = NARROW_COLUMNS) -> None:
     """Print a table to stdout without its empty columns; on a terminal of fewer columns than
     `narrow_columns`, each row as a block of lines.
     """
-    console = PlainConsole(highlight=False)
+    console = PlainConsole()
     table.columns = [column for column in table.columns if any(column.cells)]
     if console.width >= narrow_columns:
         console.print(table)

@@ -15,6 +15,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 from nlos_calibration.errors import CalibrationError
+from rich.markup import escape
 from rich.table import Table
 
 from nlos_cam.cli.common import Detail, Json, finish, say, say_interrupted, set_detail, show
@@ -130,13 +131,21 @@ def _checked(path: Path, name: str, value: object) -> str | int:
         )
     if not isinstance(value, str) or not value:
         raise RecordingError(f"{path}: {name} must be a text in quotes (got {value!r:.40})")
-    scheme, colon, rest = value.rpartition(":") if name == "camera" else ("", "", value)
+    scheme, colon, rest = _split_scheme(value) if name == "camera" else ("", "", value)
     is_path = name != "camera" or _is_file_of_camera(path.parent / rest)
     if name == "weights":
         from nlos_models import SHIPPED  # not for the help page
 
         is_path = value not in SHIPPED or (path.parent / value).exists()
     return f"{scheme}{colon}{path.parent / Path(rest).expanduser()}" if is_path else value
+
+
+def _split_scheme(camera: str) -> tuple[str, str, str]:
+    """Return scheme, colon and rest of a camera's name; a path alone may have colons of its own."""
+    from nlos_cam.camera import SCHEMES  # not for the help page
+
+    scheme, colon, rest = camera.partition(":")
+    return (scheme, colon, rest) if scheme in SCHEMES else ("", "", camera)
 
 
 def _is_file_of_camera(path: Path) -> bool:
@@ -417,7 +426,8 @@ def config(json: Json = False) -> None:
     if not json:
         table = Table("setting", "value", "from", "stands for", box=None, pad_edge=False)
         for name, (value, source) in settings.items():
-            table.add_row(name, "" if value is None else str(value), source, SETTINGS[name].meaning)
+            shown = "" if value is None else escape(str(value))
+            table.add_row(name, shown, escape(source), SETTINGS[name].meaning)
         show(table)
     result = {
         name: {"value": value, "source": source} for name, (value, source) in settings.items()

@@ -18,7 +18,6 @@ __all__ = [
     "TEST_SEED",
     "TRAINING_OUTLIERS",
     "TRAINING_SEED",
-    "TRUTH_SUFFIX",
     "BareMaps",
     "Benches",
     "BuildReport",
@@ -86,7 +85,6 @@ from .build import (
 )
 from .labelled import (
     FRAMES_PER_RECORDING,
-    TRUTH_SUFFIX,
     Labelled,
     OpenBench,
     as_map_set,

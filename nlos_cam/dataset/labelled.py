@@ -28,10 +28,6 @@ from nlos_cam.reconstruct import CalibratedRig, OwnMaps, open_bench
 from nlos_cam.recording import ReplayCamera, Sidecar, load_sidecar, open_lidar_bag, sidecar_path
 from nlos_cam.render import HiddenObject, SceneFile
 
-TRUTH_SUFFIX = ".truth.toml"
-"""Suffix of a file with the fields of a scene file's [object]: the object, and its pose in the
-rig's object box.
-"""
 FRAMES_PER_RECORDING = 8
 """Frames of a recording differ by their noise alone: more of them add little."""
 
@@ -69,7 +65,7 @@ def truth_depth_m(recording: Path, label: str, rig: Rig, known: Mapping[str, Flo
         return known[label]
     raise RecordingError(
         f"{recording} has the label {label!r}, which is not a benchmark object (such as"
-        f" {next(iter(known), 'cup-1')}), and no file describes it: add {label}{TRUTH_SUFFIX}"
+        f" {next(iter(known), 'cup-1')}), and no file describes it: add {label}{shapes.TRUTH_SUFFIX}"
         f" (object, pose) or a depth map {label}{shapes.DEPTH_MAP_SUFFIX}"
     )
 
@@ -88,7 +84,7 @@ def _truth_file(folder: Path, name: str) -> Path | None:
     """
     found = [
         path
-        for end in (TRUTH_SUFFIX, shapes.DEPTH_MAP_SUFFIX)
+        for end in (shapes.TRUTH_SUFFIX, shapes.DEPTH_MAP_SUFFIX)
         if (path := folder / f"{name}{end}").is_file()
     ]
     if len(found) > 1:
@@ -97,7 +93,7 @@ def _truth_file(folder: Path, name: str) -> Path | None:
         )
     if not found and (meshes := _meshes(folder, name)):
         raise RecordingError(
-            f"{meshes[0]} has no pose in the object box: write {name}{TRUTH_SUFFIX} beside it, with"
+            f"{meshes[0]} has no pose in the object box: write {name}{shapes.TRUTH_SUFFIX} beside it, with"
             " size_m, x_m, y_m, front_m and its angles"
         )
     return found[0] if found else None

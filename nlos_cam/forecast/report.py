@@ -21,7 +21,7 @@ CAVEATS = (
     "Networks gain less from averaged frames than the linear estimate does: on the home rig nothing.",
     (
         "The linear estimate holds the winner of each cell and the edges of shadows; it knows the true"
-        " shape that it is linear about. Its depth error is a lower bound: networks err four to five"
+        " shape that it is linear about. Its depth error is a lower bound: networks err four to six"
         " times as much."
     ),
     "The paper's radiometry is brighter than any measured third bounce; the Lambertian one dimmer.",

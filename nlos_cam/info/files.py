@@ -21,6 +21,7 @@ from nlos_cam.bench import load_bench_record
 from nlos_cam.camera import pictures_command, source_to_name
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import read_arrays, read_bounded, read_toml, with_commit
+from nlos_cam.objects import TRUTH_SUFFIX
 from nlos_cam.view import SESSION_MARK
 
 MAX_TEXT_BYTES = 16 << 20
@@ -158,6 +159,7 @@ ARRAYS = (
     ({"depth_m", "verdict", "origin_m"}, REPLAYED),
     ({"depth_m", "reference_sha256"}, "difference maps of a replay"),
     ({"object_depth_m", "margin", "radiometry"}, "rendering"),
+    ({"lidar_depth_m", "infrared", "verdict"}, "frame saved from the live page"),
     ({"inliers", "map_depth_m", "facts"}, "reference of a bare wall"),
     ({"pixels", "frame_number", "timestamp_s"}, "exported stream"),
     ({"vertices_m", "faces"}, "mesh of a hidden surface"),
@@ -235,6 +237,8 @@ def _kind_of_arrays(
         known = json.loads(str(arrays["facts"]))
         facts |= {"frames": str(known.get("frames")), "serial": known.get("serial") or "not known"}
         following = [f"nlos-cam info {shlex.quote(str(path.with_suffix('.toml')))}"]
+    elif "lidar_depth_m" in names:
+        facts["verdict"] = str(arrays["verdict"]) or "none"
     elif "vertices_m" in names:
         facts |= {"vertices": str(len(arrays["vertices_m"])), "faces": str(len(arrays["faces"]))}
     else:
@@ -243,8 +247,9 @@ def _kind_of_arrays(
 
 
 def _frames(arrays: Any) -> dict[str, str]:
-    numbers = arrays["frame_number"]
-    times_s = arrays["timestamp_s"]
+    """Return number and duration of frames; of a single one its arrays are numbers."""
+    numbers = np.atleast_1d(arrays["frame_number"])
+    times_s = np.atleast_1d(arrays["timestamp_s"])
     if not len(numbers):
         return {"frames": "none"}
     span_s = times_s[-1] - times_s[0]
@@ -255,8 +260,8 @@ def _frames(arrays: Any) -> dict[str, str]:
 
 
 def describe_toml(path: Path, verify: bool) -> Description | None:
-    """Describe a wall record, scene, rig, recipe or settings file, by its keys. A record's reference
-    is read only to `verify`.
+    """Describe a wall record, scene, rig, recipe, object or settings file, by its keys. A record's
+    reference is read only to `verify`.
     """
     try:
         keys = read_toml(path)
@@ -266,35 +271,20 @@ def describe_toml(path: Path, verify: bool) -> Description | None:
         raise RecordingError(
             f"{path} is not TOML ({error}): correct it, or write it again"
         ) from error
-    quoted = shlex.quote(str(path))
-    checked = "all fields"
+    if path.name.endswith(TRUTH_SUFFIX):
+        named = keys.get("category") or keys.get("file") or "the mesh beside it"
+        facts = {"object": str(named)}
+        return Description("object of labelled recordings", facts, checked="that it is TOML")
     if {"created", "verdict"} & set(keys):
-        return _bench_record(path) if "bench_version" in keys else _wall(path, quoted, verify)
-    if "task" in keys:
-        recipe = load_recipe(path)
-        facts = {"task": recipe.task, "epochs": str(recipe.epochs)}
-        return Description(
-            "training recipe", facts, checked=checked, next=[f"nlos-cam train {recipe.task} --help"]
-        )
-    if {"pinhole", "lidar", "base"} & set(keys):
-        rig = load_rig(str(path))
-        facts = {"name": rig.name, "checksum": rig.checksum, **_pose(rig)}
-        return Description(
-            "rig", facts, checked=checked, next=[f"nlos-cam render cup --rig {quoted}"]
-        )
-    if {"rig", "object", "motion", "sensor", "faults", "radiometry"} & set(keys):
-        from nlos_cam.render import load_scene
-
-        scene = load_scene(path)
-        facts = {"name": scene.name, "rig": scene.rig.name, "radiometry": scene.radiometry}
-        facts["frames"] = (
-            f"{count(scene.motion.poses, 'pose')}, repeated" if scene.motion else "one pose"
-        )
-        following = [
-            f"nlos-cam live --camera sim:{quoted}",
-            f"nlos-cam capture --camera sim:{quoted} --out run.bag",
-        ]
-        return Description("scene of the simulated camera", facts, checked=checked, next=following)
+        return _bench_record(path) if "bench_version" in keys else _wall(path, verify)
+    readers = (
+        ({"task"}, _recipe),
+        ({"lidar", "base"}, _rig),
+        ({"rig", "object", "motion", "sensor", "faults", "radiometry"}, _scene),
+    )
+    for marks, reader in readers:
+        if marks & set(keys):
+            return reader(path)
     if path.name == "nlos-cam.toml":
         return Description(
             "settings",
@@ -305,13 +295,47 @@ def describe_toml(path: Path, verify: bool) -> Description | None:
     return None
 
 
+def _recipe(path: Path) -> Description:
+    recipe = load_recipe(path)
+    facts = {"task": recipe.task, "epochs": str(recipe.epochs)}
+    following = [f"nlos-cam train {recipe.task} --help"]
+    return Description("training recipe", facts, checked="all fields", next=following)
+
+
+def _rig(path: Path) -> Description:
+    rig = load_rig(str(path))
+    facts = {"name": rig.name, "checksum": rig.checksum, **_pose(rig)}
+    following = [f"nlos-cam render cup --rig {shlex.quote(str(path))}"]
+    return Description("rig", facts, checked="all fields", next=following)
+
+
+def _scene(path: Path) -> Description:
+    from nlos_cam.render import load_scene
+
+    scene = load_scene(path)
+    facts = {"name": scene.name, "rig": scene.rig.name, "radiometry": scene.radiometry}
+    poses = f"{count(scene.motion.poses, 'pose')}, repeated" if scene.motion else "one pose"
+    quoted = shlex.quote(str(path))
+    following = [
+        f"nlos-cam live --camera sim:{quoted}",
+        f"nlos-cam capture --camera sim:{quoted} --out run.bag",
+    ]
+    return Description(
+        "scene of the simulated camera",
+        {**facts, "frames": poses},
+        checked="all fields",
+        next=following,
+    )
+
+
 def _bench_record(path: Path) -> Description:
     load_bench_record(path.parent)
     folder = shlex.quote(str(path.parent))
     return Description("record of a bench", checked="all fields", next=[f"nlos-cam info {folder}"])
 
 
-def _wall(path: Path, quoted: str, verify: bool) -> Description:
+def _wall(path: Path, verify: bool) -> Description:
+    quoted = shlex.quote(str(path))
     record = load_wall(path)
     facts = {
         "verdict": f"{record.verdict}: {record.advice}",
@@ -369,12 +393,13 @@ def _binary(path: Path) -> RecordingError:
 JSON_KINDS = {
     "alpha": "plan of a detection",
     "bars": "figures of an evaluation",
+    "pace": "plan of an adaptation",
     "pareto_front": "table of a trade-off",
     "recording": "record of an export",
     "rig_checksum": "record of weights",
     "watches": "record of an uncertainty network",
 }
-"""Kinds of JSON files by a key that no other has."""
+"""Kinds of JSON files by a key that none has of those below it."""
 
 
 def read_json(path: Path, text: str | bytes) -> Any:
@@ -422,12 +447,18 @@ def _sidecar(path: Path, verify: bool) -> Description:
 def describe_log(path: Path, _verify: bool) -> Description | None:
     """Describe the log of a live run from all of its lines."""
     with path.open(encoding="utf-8", newline="") as file:
-        if path.suffix == ".csv":
-            rows: list[dict[str, Any]] = [*csv.DictReader(file)]
-        else:  # the last line of a killed run may be cut
-            rows = [json.loads(line) for line in file if line.endswith("\n")]
-    if not rows or not {"frame_number", "published_s", "latency_ms"} <= rows[0].keys():
+        lines = [line for line in file if line.endswith("\n")]  # a killed run may cut the last one
+    if path.suffix == ".csv":
+        table = csv.DictReader(lines)
+        names = set(table.fieldnames or ())
+        rows: list[dict[str, Any]] = [*table]
+    else:
+        rows = [json.loads(line) for line in lines]
+        names = set(rows[0]) if rows else set[str]()
+    if not {"frame_number", "published_s", "latency_ms"} <= names:
         return None
+    if not rows:
+        return Description("log of a live run", {"frames": "0"}, "", "nlos-cam live")
 
     whole = [row for row in rows if row["latency_ms"] not in {None, ""}]
     latency_ms = np.median([float(row["latency_ms"]) for row in whole])

@@ -6,6 +6,7 @@ __all__ = [
     "MESH_SUFFIXES",
     "OBJECTS_PER_CATEGORY",
     "TEXTURES",
+    "TRUTH_SUFFIX",
     "BenchmarkObject",
     "Coat",
     "MeshFile",
@@ -57,6 +58,7 @@ from .loading import load_object, object_kind, without_absent
 from .meshes import (
     DEPTH_MAP_SUFFIX,
     MESH_SUFFIXES,
+    TRUTH_SUFFIX,
     MeshFile,
     Up,
     folder_objects,

@@ -123,6 +123,10 @@ def _absolute_index(vertices: int, relative: re.Match[bytes]) -> bytes:
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply")
 DEPTH_MAP_SUFFIX = ".npy"
+TRUTH_SUFFIX = ".truth.toml"
+"""Suffix of a file with the fields of a scene file's [object]: the object, and its pose in the
+rig's object box.
+"""
 MAX_FACES = 2_000_000
 """Read in 2 s (binary .stl) to 16 s (text .ply) and placed in 4 s, on two busy cores."""
 MAX_BYTES = 2**28
@@ -269,9 +273,14 @@ def _triangles_of(content: bytes, suffix: str) -> Float64:
         return _ply_polygons(content)
     parts = _parts(content, suffix)
     triangles = np.concatenate([np.empty((0, 3, 3)), *(_triangles(part) for part in parts)])
-    # More triangles than faces: the parser cut polygons as fans.
-    if suffix == ".ply" and len(triangles) > _ply_face_count(content):
-        return _ply_polygons(content)
+    if suffix == ".ply":
+        faces = _ply_face_count(content)
+        if len(triangles) > faces:  # the parser cut polygons as fans
+            return _ply_polygons(content)
+        if (
+            len(triangles) < faces
+        ):  # of a text file that is cut short, the parser takes what is left
+            raise _MeshProblemError(f"it has {len(triangles)} of {faces} faces")
     return triangles
 
 

@@ -7,6 +7,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from nlos_calibration import (
+    TOLERANCE_DEG,
+    TOLERANCE_M,
     Rig,
     box_difference_m,
     lidar_visible_share,
@@ -32,7 +34,15 @@ from nlos_cam.reconstruct.alignment import (
     rig_to_align_with,
     training_rig,
 )
-from nlos_cam.reconstruct.wall_grid import beyond_trained, grid_of, is_wall_grid
+from nlos_cam.reconstruct.wall_grid import (
+    ALONG_RANGE_M,
+    ASIDE_RANGE_M,
+    OCCLUDER_RANGE_M,
+    PITCH_RANGE_DEG,
+    beyond_trained,
+    grid_of,
+    is_wall_grid,
+)
 
 NEAR_M = 0.010
 NEAR_DEG = 2.0
@@ -108,9 +118,7 @@ def weights_serve(
         sentence = "the weights serve this bench: they were trained for its rig"
         return WeightsVerdict("trained for it", sentence, expected_iou)
 
-    advice = (
-        f"`nlos-cam adapt {bench}` trains weights for it{_prospects(expected_iou, present_iou)}"
-    )
+    advice = _advice(bench, expected_iou, present_iou)
     if grid_of(trained) and (wanted or not trained.rig):
         service, sentence = _grid_serves(rig, wanted)
         return WeightsVerdict(service, f"{sentence}; {advice}", expected_iou, present_iou)
@@ -127,12 +135,19 @@ def weights_serve(
     return WeightsVerdict(service, sentence, expected_iou, present_iou)
 
 
-def _prospects(expected_iou: float | None, present_iou: float | None) -> str:
-    """Return in parentheses what weights of its own, and those in use, can reach on a bench."""
+def _advice(bench: str, expected_iou: float | None, present_iou: float | None) -> str:
+    """Return what weights of a bench's own would bring, and the command that trains them where they
+    are worth it.
+    """
+    advice = f"`nlos-cam adapt {bench}` trains weights for it"
     if expected_iou is None:
-        return ""
-    present = "" if present_iou is None else f"; those in use about {present_iou:.2f}"
-    return f" (expected silhouette IoU {expected_iou:.2f} after hours of training{present})"
+        return advice
+    expected = f"expected silhouette IoU {expected_iou:.2f} after hours of training"
+    if present_iou is None:
+        return f"{advice} ({expected})"
+    if expected_iou <= present_iou:
+        advice = "weights of its own are not expected to do better"
+    return f"{advice} ({expected}; those in use about {present_iou:.2f})"
 
 
 def _aligned_serves(rig: Rig, trained: CheckpointRecord, own: Rig) -> tuple[Service, str]:
@@ -237,20 +252,26 @@ def weights_for(rig: Rig, names: Sequence[str] = BENCH_WEIGHTS) -> Path:
     """
     if rig.occluder is None:  # how wide its gap is decides
         return shipped_folder(names[0])
-    return shipped_folder(max(names, key=lambda name: _shipped_iou(rig, name)))
+
+    def iou_or_guess(name: str) -> float:
+        found = _shipped_iou(rig, name)
+        return GUESS_IOU if found is None else found
+
+    return shipped_folder(max(names, key=iou_or_guess))
 
 
 def shipped_iou(rig: Rig, weights: Path) -> float | None:
     """Return the silhouette IoU that can be expected of a folder of shipped weights on a rig; None
-    for other weights, for those of the paper's network, and for a rig without an occluder.
+    for other weights, for those of the paper's network, for a rig without an occluder, and where no
+    figure is known.
     """
     name = shipped_name(weights)
     return _shipped_iou(rig, name) if name in BENCH_WEIGHTS and rig.occluder else None
 
 
-def _shipped_iou(rig: Rig, name: str) -> float:
-    """Return the silhouette IoU that can be expected of shipped weights on a rig with an occluder, 0
-    where they do not serve it.
+def _shipped_iou(rig: Rig, name: str) -> float | None:
+    """Return the silhouette IoU that can be expected of shipped weights on a rig with an occluder: 0
+    where they do not serve it, None beyond the rigs that LOSSES or ANY_GAINS are fitted to.
     """
     trained = load_record(shipped_folder(name))
     service = weights_serve(rig, trained).service
@@ -258,9 +279,40 @@ def _shipped_iou(rig: Rig, name: str) -> float:
         return 0.0
     own = training_rig(trained)
     if own is None or is_wall_grid(own):
-        return float(np.dot(ANY_GAINS, any_terms(rig))) if service == "near" else GUESS_IOU
+        return float(np.dot(ANY_GAINS, any_terms(rig))) if service == "near" else None
+    if not _costs_are_known(rig, own):
+        return None
     lost = float(np.dot(LOSSES, aligned_terms(rig, own)))
     return max(HOME_IOU[name] - lost, GUESS_IOU)
+
+
+def _costs_are_known(rig: Rig, own: Rig) -> bool:
+    """Return whether a rig differs from that of weights in what LOSSES has terms for, and otherwise
+    by no more than the rigs that it is fitted to.
+    """
+    here = object_box(rig)
+    there = object_box(own)
+    moved_m = here.x_min_m - there.x_min_m
+    lowest_m, highest_m = ALONG_RANGE_M
+    if not lowest_m - TOLERANCE_M <= moved_m <= highest_m + TOLERANCE_M:
+        return False
+    # The box and the occluder of a lidar that was put elsewhere along the wall move together.
+    back = here.model_copy(
+        update={"x_min_m": here.x_min_m - moved_m, "x_max_m": here.x_max_m - moved_m}
+    )
+    box_m = max(
+        abs(getattr(back, name) - getattr(there, name)) for name in type(there).model_fields
+    )
+    occluder_m = 0.0
+    if rig.occluder and own.occluder:
+        occluder_m = abs(rig.occluder.x_m - moved_m - own.occluder.x_m)
+    return (
+        abs(rig.lidar.pitch_deg - own.lidar.pitch_deg) <= PITCH_RANGE_DEG[1] + TOLERANCE_DEG
+        and box_m <= ASIDE_RANGE_M[1] + TOLERANCE_M
+        and occluder_m <= OCCLUDER_RANGE_M[1] + TOLERANCE_M
+        and view_difference_deg(rig.pinhole, own.pinhole) <= NEAR_DEG
+        and missing_wall(rig, own) <= NEAR_WALL
+    )
 
 
 def _deviation(rig: Rig, wanted: Rig) -> float:

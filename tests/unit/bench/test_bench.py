@@ -76,6 +76,16 @@ def test_object_box_of_the_bench_is_that_of_its_rig(folder: Path) -> None:
     assert load_bare_wall(folder).record.rig.object_box.x_max_m == 0.6
 
 
+def test_bench_with_another_object_box_is_judged_anew(folder: Path) -> None:
+    before = load_bench(folder).measured.record
+    set_line(folder, "x_min_m", "x_min_m = 0.02")
+    after = load_bench(folder).measured.record
+
+    assert before.verdict == "good"
+    assert after.verdict == "out of range"
+    assert "move the object" in after.advice
+
+
 def test_bare_wall_stays_where_the_occluders_files_are_lost(folder: Path) -> None:
     (folder / "stations/main/occluder.toml").write_text("half of it", encoding="utf-8")
 

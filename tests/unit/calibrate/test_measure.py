@@ -1,5 +1,5 @@
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -125,6 +125,25 @@ def test_a_lidar_that_moved_while_it_measured_is_refused(moved: range, wanted: i
     with pytest.raises(WallRefusedError, match="let it stand still"):
         measure.measure_by_depth(capture)
     measure.measure_by_depth(collect_statistics(WallCamera(60), 60))
+
+
+class TooShort(WallCamera):
+    """Its depths are so short that no part of the capture is a bare wall by itself."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in super().__iter__():
+            yield replace(frame, depth_m=frame.depth_m - np.float32(0.022))
+
+
+def test_bump_is_found_also_where_a_tape_tells_of_an_offset() -> None:
+    still = collect_statistics(TooShort(60), 60)
+    bumped = collect_statistics(TooShort(60, range(30)), 60)
+
+    with pytest.raises(WallRefusedError):
+        measure.measure_by_depth(still)
+    assert measure.measure_by_depth(still, 0.2)[1]["range_offset_cause"] == "depth"
+    with pytest.raises(WallRefusedError, match="let it stand still"):
+        measure.measure_by_depth(bumped, 0.2)
 
 
 def test_parts_of_a_long_capture_are_few_and_span_it() -> None:

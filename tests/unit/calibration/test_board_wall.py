@@ -91,6 +91,15 @@ def test_agreeing_board_keeps_a_doubtful_verdict_of_the_depth(depth: WallFit) ->
     assert fit.advice == "half of the view differs"
 
 
+def test_agreeing_board_judges_the_combined_wall_anew(depth: WallFit) -> None:
+    """The depth alone was just out of range, the plane of both is inside."""
+    beyond = replace(depth, verdict="out of range", advice="move the lidar 1 cm closer")
+    fit, _ = wall_with_board(beyond, infrared(), PINHOLE, A4, measured=False)
+
+    assert fit.verdict == "good"
+    assert fit.advice.endswith("inside the paper's ranges; depth and board agree")
+
+
 @pytest.mark.parametrize(
     ("measured", "used", "distance_m"),
     [(False, "depth", TRUE_M), (True, "board", PRINTED_AT_97_PERCENT_M)],

@@ -129,6 +129,22 @@ def test_judge_rig_advises_on_a_misplaced_sheet(
     assert move in problem
 
 
+@pytest.mark.parametrize(
+    ("x_min_m", "cure"),
+    [
+        (0.02, "move the object 18 cm away from the lidar"),
+        (0.15, "move it 6 cm towards the lidar, to 0.14 m"),
+    ],
+)
+def test_judge_rig_makes_room_for_a_sheet_before_the_box(x_min_m: float, cure: str) -> None:
+    bench = rig().model_copy(
+        update={"object_box": BOX.model_copy(update={"x_min_m": x_min_m, "x_max_m": 0.4})}
+    )
+    (problem,) = problems(bench)
+
+    assert cure in problem
+
+
 def test_judge_rig_says_that_a_bench_is_a_mirror_image() -> None:
     (problem,) = problems(rig(-0.2, yaw_deg=-45.0))
 

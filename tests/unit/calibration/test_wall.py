@@ -337,6 +337,29 @@ def test_tape_offset_is_added_to_depth_that_is_too_short(yaw_deg: float, offset_
     assert taped.fit.verdict == "good"
 
 
+@pytest.mark.parametrize(
+    ("yaw_deg", "offset_m"), [(45.0, 0.02), (70.0, 0.013), (75.0, 0.009), (75.0, 0.013)]
+)
+def test_tape_offset_of_depth_is_found_where_the_origins_is_too_large(
+    yaw_deg: float, offset_m: float
+) -> None:
+    """On an oblique wall an origin would have to be up to three times as far off."""
+    taped = fit_with_tape_distance(read_as(bare(0.2, yaw_deg) - offset_m), 0.2)
+
+    assert taped.cause == "depth"
+    assert taped.offset_m == pytest.approx(offset_m, abs=5e-5)
+
+
+def test_wall_in_doubt_with_a_tape_does_not_ask_for_one() -> None:
+    short = read_as(bare(0.2, 45.0) - 0.0045)
+    plain = short(0.0, 0.0)
+    misread = fit_with_tape_distance(short, plain.distance_m)
+
+    assert "--tape-m" in plain.advice
+    assert "--tape-m" not in misread.fit.advice
+    assert "measure the distance again" in misread.fit.advice
+
+
 @pytest.mark.parametrize("offset_m", [-0.0045, 0.0045])
 @pytest.mark.parametrize("yaw_deg", [20.0, 45.0, 65.0])
 def test_tape_offset_of_the_origin_moves_the_pose_along_the_axis(

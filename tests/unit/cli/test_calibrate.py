@@ -207,6 +207,13 @@ def test_calibrate_takes_frames_and_the_entered_occluder(camera: FakeCamera, sho
     assert_has(printed, "250.0 mm", "80.0 mm", "entered")
 
 
+def test_recording_is_not_watched(run: Run) -> None:
+    Path("run.bag").touch()
+
+    for source in (["run.bag"], ["--bag", "run.bag"]):
+        assert "not for a recording" in run("calibrate", "--wall", *source, "--watch", code=2).err
+
+
 @pytest.mark.usefixtures("camera")
 def test_calibrate_measures_after_watching(shown: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", StringIO("\n"))

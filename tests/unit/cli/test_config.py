@@ -106,7 +106,7 @@ def test_paths_of_the_users_file_are_relative_to_it(folders: tuple[Path, Path]) 
     assert settings["camera"].value == f"sim:{folders[1] / 'scene.toml'}"
 
 
-@pytest.mark.parametrize("name", ["run.bag", "ros.mcap", "ros.db3", "ros"])
+@pytest.mark.parametrize("name", ["run.bag", "cup_12:30.bag", "ros.mcap", "ros.db3", "ros"])
 def test_recording_of_the_users_file_is_relative_to_it(
     folders: tuple[Path, Path], name: str
 ) -> None:
@@ -176,6 +176,19 @@ def test_wrong_file_is_refused_with_its_name(
 def test_wrong_variable_is_a_usage_error() -> None:
     with pytest.raises(typer.BadParameter, match="NLOS_CAM_VIEW_PORT"):
         read_settings({"NLOS_CAM_VIEW_PORT": "many"})
+
+
+def test_config_shows_values_as_they_are(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Brackets and words between colons mean something to the library that prints tables."""
+    monkeypatch.setenv("NLOS_CAM_BENCH", "a[/copy]")
+    monkeypatch.setenv("NLOS_CAM_CACHE", "b:car:c")
+    main(["config"])
+    printed = capsys.readouterr().out
+
+    assert "a[/copy]" in printed
+    assert "b:car:c" in printed
 
 
 def test_config_shows_values_and_sources(

@@ -47,6 +47,14 @@ ARRAYS = {
     },
     "difference maps of a replay": {**FRAMES, "depth_m": [1.0], "reference_sha256": "abc"},
     "rendering": {"object_depth_m": [np.nan, 1.0], "margin": [1.0], "radiometry": "paper"},
+    "frame saved from the live page": {
+        "depth_m": [1.0],
+        "lidar_depth_m": [1.0],
+        "infrared": [1],
+        "frame_number": 3,
+        "timestamp_s": 0.1,
+        "verdict": "object seen",
+    },
     "exported stream": {**FRAMES, "pixels": [[1]], "encoding": "z16"},
     "mesh of a hidden surface": {"vertices_m": np.zeros((3, 3)), "faces": np.zeros((1, 3))},
     "arrays of another program": {"x": [1.0]},
@@ -96,6 +104,13 @@ def files(
         made[kind] = folder / kind
     made["figures of an evaluation"] = made["evaluation"] / "figures.json"
     made["table of a trade-off"] = made["trade-off"] / "tradeoff.json"
+    for name, content, kind in (
+        ("plan.json", '{"rig_checksum": "a", "pace": {}, "stages": []}', "plan of an adaptation"),
+        ("cup.truth.toml", 'category = "cup"\n', "object of labelled recordings"),
+        ("empty-log.csv", "frame_number,published_s,latency_ms\n", "log of a live run"),
+    ):
+        made[kind] = folder / name
+        made[kind].write_text(content)
     session = Session.start(folder / "detection", made_plan())
     made_turns(session.plan)[0].save(session.path(0))
     made["detection"] = session.folder
@@ -134,6 +149,7 @@ KINDS = [
     ),
     *("figures of an evaluation", "table of a trade-off"),
     *("detection", "plan of a detection", "turn of a detection"),
+    *("plan of an adaptation", "object of labelled recordings", "log of a live run"),
     *("mesh", "point cloud", "files of single frames", "recordings"),
 ]
 

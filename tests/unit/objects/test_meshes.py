@@ -229,6 +229,7 @@ def test_read_mesh_joins_parts_and_equals_by_path_and_content(tmp_path: Path) ->
         ("thing.glb", b"glTF", ".ply"),
         ("points.ply", trimesh.PointCloud(SQUARE).export(file_type="ply"), "faces"),
         ("short.stl", EXPORTS["text.stl"][:900], "faces"),
+        ("short.ply", PLY[: PLY.rindex(b"3 ")], "faces"),
         *[
             (name, content, "faces")
             for name, content in (

@@ -7,7 +7,7 @@ import pytest
 from nlos_calibration import Rig, load_rig
 from nlos_models import ANY, load_record, shipped_folder
 
-from nlos_cam.reconstruct import WALL_GRID, grid_of, weights_for, weights_serve
+from nlos_cam.reconstruct import WALL_GRID, grid_of, shipped_iou, weights_for, weights_serve
 
 RIG = load_rig("paper-rig")
 
@@ -100,6 +100,36 @@ def with_gap(gap_m: float, **lidar: float) -> Rig:
 )
 def test_bench_gets_the_weights_that_serve_it_best(rig: Rig, name: str) -> None:
     assert weights_for(rig).name == name
+
+
+@pytest.mark.parametrize(
+    "rig",
+    [
+        posed(pitch_deg=10.0),
+        with_box_moved(x=0.04),
+        with_box_moved(y=0.1),
+        with_focal_length(700.0),
+    ],
+)
+def test_differences_whose_cost_is_not_known_have_no_figure(rig: Rig) -> None:
+    assert shipped_iou(RIG, shipped_folder()) == pytest.approx(0.79)
+    assert shipped_iou(posed(pitch_deg=1.0), shipped_folder()) == pytest.approx(0.79)
+    assert shipped_iou(rig, shipped_folder()) is None
+
+
+@pytest.mark.parametrize(
+    ("present_iou", "is_advised"), [(None, True), (0.6, True), (0.66, False), (0.75, False)]
+)
+def test_adapting_is_advised_only_where_it_is_expected_to_help(
+    present_iou: float | None, is_advised: bool
+) -> None:
+    verdict = weights_serve(
+        posed(distance_m=0.22), trained(), expected_iou=0.66, present_iou=present_iou
+    )
+
+    assert verdict.adapting_helps is is_advised
+    assert ("nlos-cam adapt" in verdict.sentence) is is_advised
+    assert "expected silhouette IoU 0.66" in verdict.sentence
 
 
 def test_shipped_weights_for_any_rig_know_todays_grid() -> None:
