@@ -75,6 +75,7 @@ SpreadMm = Annotated[
     typer.Option(
         "--rig-spread-mm",
         min=0,
+        max=1000,
         help="Largest shift of lidar and occluder, drawn per object, in mm.",
     ),
 ]
@@ -83,6 +84,7 @@ SpreadDeg = Annotated[
     typer.Option(
         "--rig-spread-deg",
         min=0,
+        max=90,
         help="Largest turn of the lidar in yaw and pitch, drawn per object.",
     ),
 ]
@@ -91,6 +93,7 @@ GainSpread = Annotated[
     typer.Option(
         "--gain-spread-percent",
         min=0,
+        max=100,
         help="Largest change of the intensity gain, drawn per object.",
     ),
 ]
@@ -102,6 +105,10 @@ ObjectsPerRig = Annotated[
         help="Objects that share a draw of the spreads (default: 1, with --any-rig 25); 50 render 4"
         " times as fast.",
     ),
+]
+UpAxis = Annotated[
+    Literal["y", "z"] | None,
+    typer.Option("--up", help="Axis of the meshes of --objects that points up (default: y)."),
 ]
 OffRecord = Annotated[
     bool,
@@ -187,6 +194,7 @@ def build(
     without: LeftOut = "",
     backgrounds: Backgrounds = 0.0,
     share_generic: ShareGeneric = 0.0,
+    up: UpAxis = None,
     colour: Color = False,
     rig_spread_mm: SpreadMm = 0.0,
     rig_spread_deg: SpreadDeg = 0.0,
@@ -214,7 +222,7 @@ def build(
     plan = data.DatasetPlan.of_scene(
         renderer.load_scene(scene) if scene else renderer.SceneFile(name="bare", rig=its_rig),
         seed,
-        objects=_objects(objects, without, backgrounds, share_generic),
+        objects=_objects(objects, without, backgrounds, share_generic, up),
         accuracy=renderer.accuracy_named(accuracy).name,
         spread=spread,
         textures=tuple(shapes.TEXTURES) if colour else (),
@@ -344,8 +352,16 @@ def _command(context: typer.Context, name: str) -> str:
     return shlex.join(words)
 
 
-def _objects(objects: str, without: str, backgrounds: float, share_generic: float) -> data.Objects:
+def _objects(
+    objects: str,
+    without: str,
+    backgrounds: float,
+    share_generic: float,
+    up: shapes.Up | None,
+) -> data.Objects:
     if objects == PROCEDURAL:
+        if up:
+            raise typer.BadParameter("--up is for the meshes of a folder: drop it")
         left_out = [name.strip() for name in without.split(",") if name.strip()]
         return data.Objects.without(left_out, backgrounds, share_generic)
     if without or backgrounds:
@@ -353,9 +369,8 @@ def _objects(objects: str, without: str, backgrounds: float, share_generic: floa
             "--without and --backgrounds are for procedural objects: drop them"
         )
     with common.tracked("reading meshes") as on_progress:
-        return replace(
-            data.objects_from_folder(Path(objects), on_progress), share_generic=share_generic
-        )
+        meshes = data.objects_from_folder(Path(objects), on_progress)
+    return replace(meshes, share_generic=share_generic, up=up or "y")
 
 
 class Rate(ProgressColumn):

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 
 from nlos_cam.dataset.rig_range import RigRange
 from nlos_cam.errors import SceneError
-from nlos_cam.objects import CATEGORIES, JUMP_M, find_category, object_box
+from nlos_cam.objects import CATEGORIES, JUMP_M, Up, find_category, object_box
 from nlos_cam.render import RENDERING_VERSION, Material, Radiometry, SceneFile, SensorModel
 
 OBJECTS_VERSION = 2
@@ -163,6 +163,8 @@ class Objects:
     """Share of the procedural objects with a post or a panel beside them."""
     share_generic: float = 0.0
     """Share of generic shapes (`nlos_cam.objects.generic_depth`) among the objects."""
+    up: Up = "y"
+    """Axis of the meshes that points up."""
     version: int = OBJECTS_VERSION
     folder: Path | None = field(default=None, compare=False)
     """Folder of the meshes on this machine."""
@@ -255,6 +257,8 @@ class DatasetPlan:
             del facts["rigs"]
         if not self.objects.share_generic:
             del facts["objects"]["share_generic"]  # and checksums of older plans stay
+        if self.objects.up == "y":
+            del facts["objects"]["up"]  # likewise
         return json.dumps({**facts, "rig_checksum": self.rig.checksum})
 
     @classmethod

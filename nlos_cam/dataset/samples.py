@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nlos_calibration import ObjectBox, Rig
+from nlos_calibration import ObjectBox, Rig, load_rig
 from nlos_calibration.arrays import Float32
 from numpy.typing import NDArray
 
@@ -104,8 +104,14 @@ def sense_color(
     depth, and in red, green and blue.
     """
     albedo = np.asarray(scene.surface.albedo)
-    lights = (albedo.mean(-1), *np.moveaxis(albedo, -1, 0))
-    scenes = (replace(scene, surface=Surface(light, scene.surface.brdf)) for light in lights)
+    surfaces = [
+        Surface(light, scene.surface.brdf)
+        for light in (albedo.mean(-1), *np.moveaxis(albedo, -1, 0))
+    ]
+    if scene.radiometry == "lambertian":
+        # Light between parts of the object is that of each color, not that of the mean albedo.
+        surfaces[0] = scene.surface
+    scenes = (replace(scene, surface=surface) for surface in surfaces)
     white, *colors = (
         sense_object(one, sensor, seed, accuracy, exposure, expected=expected)
         for exposure, one in enumerate(scenes)
@@ -243,7 +249,11 @@ def hidden_object(objects: Objects, seed: int, box: ObjectBox) -> tuple[str, Flo
     if (folder := objects.folder) is None:
         raise SceneError("this dataset hides meshes: name their folder with --objects")
     (name, _), depth_m = shapes.mesh_depth(
-        seed, objects.meshes, box, read=lambda mesh: _unchanged(folder / mesh[0], mesh[1])
+        seed,
+        objects.meshes,
+        box,
+        objects.up,
+        read=lambda mesh: _unchanged(folder / mesh[0], mesh[1]),
     )
     return name, depth_m
 
@@ -254,9 +264,10 @@ MAX_NAMED = 10
 
 def objects_from_folder(folder: Path, on_progress: OnProgress = ignore) -> Objects:
     """Read the meshes of a folder and its subfolders. Raises SceneError for none, or one that
-    cannot be used.
+    cannot be used: once shards are written, the folder must stay as it is.
     """
     paths = shapes.folder_objects(folder)
+    box = shapes.object_box(load_rig("paper-rig"))
     meshes = list[tuple[str, str]]()
     problems = list[SceneError]()
     for number, path in enumerate(paths, start=1):
@@ -266,7 +277,9 @@ def objects_from_folder(folder: Path, on_progress: OnProgress = ignore) -> Objec
         except UnicodeEncodeError as error:  # a shard stores names as UTF-8
             raise SceneError(f"the name of the mesh {name!a} is not UTF-8: rename it") from error
         try:
-            meshes.append((name, shapes.read_mesh(path).sha256))
+            mesh = shapes.read_mesh(path)
+            shapes.check_visible(mesh, box)
+            meshes.append((name, mesh.sha256))
         except SceneError as error:
             problems.append(error)
         on_progress(number, len(paths))

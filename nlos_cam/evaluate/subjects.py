@@ -376,6 +376,13 @@ def notes_about(
         notes.append(
             "the maps were recorded; the objects of the nearest neighbour are rendered for their rig"
         )
+    if data.TRAINING_SEED <= objects.plan.first_seed < data.HELD_OUT_SEED and not (
+        objects.plan.objects.meshes or objects.plan.accuracy == data.RECORDED
+    ):
+        notes.append(
+            f"the objects have seeds of training ({objects.plan.first_seed} on): these weights may"
+            f" have seen them; build others from --seed {data.HELD_OUT_SEED} on"
+        )
     if unseen := sorted(set(left_out_categories(record)) & set(objects.categories)):
         notes.append(f"the weights' VAE was trained without {', '.join(unseen)}")
     return notes

@@ -374,12 +374,23 @@ def mesh_depth(
     """
     generator = np.random.default_rng([seed, OBJECT_PIXELS])
     picked = meshes[int(generator.integers(len(meshes)))]
-    mesh = read(picked)
+    return picked, _posed_depth(read(picked), box, up, generator)
+
+
+def check_visible(mesh: MeshFile, box: ObjectBox) -> None:
+    """Raise SceneError for a mesh that shows no surface in any of POSES poses in a box."""
+    _posed_depth(mesh, box, "y", np.random.default_rng(0))
+
+
+def _posed_depth(mesh: MeshFile, box: ObjectBox, up: Up, generator: np.random.Generator) -> Float32:
+    """Return the depth map of a mesh in the first of POSES random poses that shows a surface.
+    Raises SceneError where none does.
+    """
     triangles = turn_upright(mesh.triangles, up)
     for _ in range(POSES):
         depth_m = orthographic_depth(place(triangles, random_pose(generator, box), box), box)
         if not np.isnan(depth_m).all():
-            return picked, depth_m
+            return depth_m
     raise SceneError(
         f"{mesh.path} shows no surface in any of {POSES} poses (thinner than a depth-map cell):"
         " make it thicker, or remove it from the folder"

@@ -4,7 +4,7 @@ some of them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import radians
+from math import isfinite, radians
 
 import numpy as np
 from nlos_calibration import ObjectBox
@@ -22,7 +22,7 @@ POSE_UNITS = 7
 @dataclass(frozen=True)
 class Pose:
     """Pose of an object in the box: angles about wall x, y and z in turn, size, and offsets from
-    the box's middle.
+    the box's middle. Raises SceneError for a size or a gap that no object has.
     """
 
     tilt_x_rad: float = 0.0
@@ -34,6 +34,15 @@ class Pose:
     y_m: float = 0.0
     front_m: float = 0.03
     """From z_near to the object's nearest point."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not isfinite(value):
+                raise SceneError(f"{name} is {value}: it must be finite")
+        if not self.size_m > 0:
+            raise SceneError(f"size_m is {self.size_m:g}: it must be above 0")
+        if not self.front_m >= 0:
+            raise SceneError(f"front_m is {self.front_m:g}: it must be at least 0")
 
 
 @dataclass(frozen=True)
@@ -88,8 +97,10 @@ def add_background(depth_m: Float32, box: ObjectBox, generator: np.random.Genera
 
 def category_triangles(category: str, seed: int) -> Float64:
     """Return the triangles (n, 3, 3) of one variation of a category, in its own units. Raises
-    SceneError if unknown.
+    SceneError if unknown, and for a negative seed.
     """
+    if seed < 0:
+        raise SceneError(f"seed is {seed}: it must be at least 0")
     kind = find_category(category)
     return kind.make(**kind.draw(np.random.default_rng(seed).random(len(kind.settings))))
 

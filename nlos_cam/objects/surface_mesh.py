@@ -90,8 +90,8 @@ def mesh_from_depth(
     # Vertices: first the cells that triangles use, then four for each cell that none uses.
     alone = np.setdiff1d(np.flatnonzero(np.isfinite(depth_m)), faces)
     used = np.unique(faces)
-    half_x_m = 0.5 * (x_m[1] - x_m[0])
-    half_y_m = 0.5 * (y_m[0] - y_m[1])
+    half_x_m = 0.5 * (box.x_max_m - box.x_min_m) / len(depth_m)
+    half_y_m = 0.5 * (box.y_max_m - box.y_min_m) / len(depth_m)
     # Corners of a lone cell's square, row by row, and its two triangles.
     corners_m = np.array([[-1, 1, 0], [1, 1, 0], [-1, -1, 0], [1, -1, 0]])
     corners_m = corners_m * (half_x_m, half_y_m, 0.0)

@@ -171,9 +171,16 @@ def pulse_bins(pulse_ns: float, bin_m: float) -> float:
     return pulse_ns * 1e-9 * SPEED_OF_LIGHT_M_PER_S * SIGMAS_PER_FWHM / bin_m
 
 
-def with_pulse(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
+def pulse_tail(pulse_ns: float, bin_m: float) -> int:
+    """Return the number of bins by which the pulse makes a histogram longer."""
+    return len(_pulse(pulse_ns, bin_m)) // 2 if pulse_ns else 0
+
+
+def with_pulse(
+    histogram: Float32, pulse_ns: float, bin_m: float, at_most: int | None = None
+) -> Float32:
     """Return histograms (n, bins) convolved with the pulse; longer by its tail, so that no light is
-    lost.
+    lost, but for what would come after `at_most` bins.
     """
     if pulse_ns == 0:
         return histogram
@@ -183,7 +190,8 @@ def with_pulse(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
     # Convolution theorem; zero padding by the kernel's length keeps the end from wrapping to the
     # start.
     of_pulse = np.fft.rfft(kernel, size)
-    wide = np.empty((len(histogram), size - half), np.float32)
+    kept = size - half if at_most is None else min(size - half, at_most)
+    wide = np.empty((len(histogram), kept), np.float32)
     # A transform takes several times the memory of what it transforms: some rows at a time.
     at_once = max(1, TRANSFORM_VALUES // size)
     for start in range(0, len(histogram), at_once):
@@ -191,7 +199,7 @@ def with_pulse(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
         spectrum = np.fft.rfft(histogram[rows].astype(np.float64), size, axis=1) * of_pulse
         # What would come before time 0 is cut, and rounding of the transform leaves tiny values
         # below 0 where there is no light.
-        wide[rows] = np.maximum(np.fft.irfft(spectrum, size, axis=1)[:, half:], 0)
+        wide[rows] = np.maximum(np.fft.irfft(spectrum, size, axis=1)[:, half : half + kept], 0)
     return wide
 
 

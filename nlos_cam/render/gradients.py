@@ -39,7 +39,7 @@ from nlos_cam.render.gradient_legs import (
     softened_slope,
 )
 from nlos_cam.render.job import TransportJob
-from nlos_cam.render.material import brdf_mean
+from nlos_cam.render.material import without_lobe
 from nlos_cam.render.planning import RenderProblem, prepare
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_facts import bins_of
@@ -359,7 +359,7 @@ class Gradients:
         it.
         """
         brdf = self.problem.scene.surface.brdf
-        return 1.0 if brdf is None else brdf_mean(brdf)
+        return 1.0 if brdf is None else without_lobe(brdf)
 
     def image(self, values: Float64) -> Float64:
         """Return the patches' values as an image of the depth map, 0 for background."""

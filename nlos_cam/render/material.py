@@ -112,6 +112,8 @@ class Surface:
 
     def __post_init__(self) -> None:
         albedo = np.asarray(self.albedo)
+        if albedo.dtype.kind not in "fiub":
+            raise SceneError(f"albedo is {self.albedo!r:.40}: give numbers from 0 to 1")
         if albedo.size == 0 or albedo.ndim > 3 or (albedo.ndim in {1, 3} and albedo.shape[-1] != 3):
             raise SceneError(
                 f"albedo has shape {albedo.shape}: give one number, three, or one or three for each"
@@ -154,9 +156,11 @@ def _check_brdf(brdf: Brdf) -> None:
         raise SceneError(f"a BRDF's exponent is {exponent:g}: it must be finite and above 0")
 
 
-def brdf_mean(brdf: Brdf) -> float:
-    """Return the value that stands for a BRDF that is left out: the middle of its range."""
-    return float(np.mean(brdf_range(brdf)))
+def without_lobe(brdf: Brdf) -> float:
+    """Return the value that stands for a BRDF that is left out: that of a matt surface which gives
+    back as much light.
+    """
+    return brdf.diffuse + brdf.specular
 
 
 def brdf_range(brdf: Brdf) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from nlos_calibration.arrays import Float64, Mask
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_ROWS
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.echoes import pulse_bins
+from nlos_cam.render.echoes import pulse_bins, pulse_tail
 from nlos_cam.render.effects import Effects, Plan, decide, included, requested
 from nlos_cam.render.energy_survey import CAUTION, occluder_meets, shaded
 from nlos_cam.render.geometry import (
@@ -28,7 +28,7 @@ from nlos_cam.render.geometry import (
 from nlos_cam.render.interreflection import longest_detour_m
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.line_of_sight import DirectVisibility
-from nlos_cam.render.material import Surface, brdf_mean
+from nlos_cam.render.material import Surface, without_lobe
 from nlos_cam.render.patches import Patches
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_facts import SceneFacts
@@ -110,9 +110,11 @@ def _brdf(facts: SceneFacts) -> Finding:
     if facts.patches is None or brdf is None:
         return "brdf", 0.0, "the surface is Lambertian" if brdf is None else "nothing is hidden"
     low, high = facts.brdf_range
-    # Without the effect the mean m of both ends replaces the BRDF: |f - m| / f is largest at f =
-    # low.
-    bound = min((high - low) / (2 * low), 1.0) if low > 0 else float(high > 0)
+    # Without the effect a matt surface of value m replaces the BRDF f: |f - m| / f is largest at
+    # one of its ends.
+    matt = without_lobe(brdf)
+    bound = max(abs(matt / low - 1), abs(matt / high - 1)) if low > 0 else float(high > 0)
+    bound = min(bound, 1.0)
     cost = "needs tables for a lattice of directions, 20 times the cost and more"
     return "brdf", bound, f"the BRDF ranges from {low:.3g} to {high:.3g}: {cost}"
 
@@ -121,8 +123,8 @@ def _color(facts: SceneFacts) -> Finding:
     if facts.patches is None or not facts.scene.surface.colored:
         return "colour", 0.0, "the albedo has one channel"
     albedo = np.asarray(facts.scene.surface.albedo, np.float64)
-    # Light is linear in albedo: with the mean in place of a channel, each patch errs by |channel -
-    # mean| / mean, and a sum of patches by no more than the worst of them.
+    # Light of three bounces is linear in albedo: with the mean in place of a channel, each patch
+    # errs by |channel - mean| / mean, and a sum of patches by no more than the worst of them.
     grey = albedo.mean(-1, keepdims=True)
     apart = float((np.abs(albedo - grey).max(-1) / np.where(grey > 0, grey, 1)[..., 0]).max())
     return "colour", min(apart, 1.0), f"channels differ by up to {apart:.3g} of their mean"
@@ -137,7 +139,12 @@ def _interreflection(facts: SceneFacts) -> Finding:
             0.0,
             "S1 to S5 have no higher orders; only lambertian radiometry includes them",
         )
-    share = CAUTION * facts.interreflection
+    # Light that meets the object twice is quadratic in albedo: its share is that of the brightest
+    # channel.
+    grey = facts.albedo
+    brightest = facts.channels.max(-1)
+    brighter = np.max(brightest / np.where(grey > 0, grey, 1), initial=1.0)
+    share = CAUTION * facts.interreflection * float(brighter)
     return (
         "inter-reflection",
         min(share, 1.0),
@@ -248,6 +255,13 @@ class RenderProblem:
         )
 
     @property
+    def mixes_colors(self) -> bool:
+        """True where the mean albedo does not render the channels' mean: light that meets the
+        object twice is quadratic in albedo.
+        """
+        return bool(self.color_jobs) and self.includes("inter-reflection")
+
+    @property
     def channels(self) -> list[Self]:
         """The problems of red, green and blue light alone, with their transport and their direct
         returns, if the plan includes color; else none.
@@ -315,10 +329,14 @@ def _job(
         job = replace(job, more_bounces=True, bins=bins)
     if not wanted.all():
         job = job.select(np.flatnonzero(wanted[beams.on_wall]))
-    size = len(job.laser_spot_m) * job.bins * (8 if job.accuracy.sub_bins == 0 else 4)
+    bins = job.bins
+    if included(verdicts, "pulse"):
+        tail = pulse_tail(facts.scene.pulse_ns, job.bin_m)
+        bins = min(bins + tail, gate_bins(facts.rig.device))
+    size = len(job.laser_spot_m) * bins * (8 if job.accuracy.sub_bins == 0 else 4)
     if size > MAX_BYTES:
         raise SceneError(
-            f"{len(job.laser_spot_m)} beams of {job.bins} bins need {size / 2**30:.1f} GiB, at most"
+            f"{len(job.laser_spot_m)} beams of {bins} bins need {size / 2**30:.1f} GiB, at most"
             f" {MAX_BYTES >> 30}: lower beams_per_cell ({job.accuracy.beams_per_cell}), widen bin_m"
             f" ({job.bin_m:g}) or shorten gate_s"
         )
@@ -334,7 +352,7 @@ def _returned_by(
     if surface.brdf is None:
         return 1.0
     if not with_brdf:
-        return brdf_mean(surface.brdf)
+        return without_lobe(surface.brdf)
     return surface.brdf(blocked.cosine, blocked.cosine, 1.0)
 
 
@@ -359,5 +377,6 @@ def _patches(facts: SceneFacts, verdicts: Plan, channel: int | None) -> Patches 
     if not included(verdicts, "tilt"):
         patches = patches.level()
     if facts.scene.surface.brdf is not None and not included(verdicts, "brdf"):
-        patches = replace(patches, albedo=patches.albedo * brdf_mean(facts.scene.surface.brdf))
+        given_back = without_lobe(facts.scene.surface.brdf)
+        patches = replace(patches, albedo=patches.albedo * given_back)
     return patches

@@ -126,9 +126,19 @@ def transient(
     """
     problem = prepare(scene, accuracy_named(accuracy), effects, bounded=False)
     lights = problem.channels or [problem]
-    parts = [_waveforms(each, beam_histograms(each, each.job, backend)) for each in lights]
+    parts = _as_long(
+        [_waveforms(each, beam_histograms(each, each.job, backend)) for each in lights]
+    )
     shaped = [part.reshape(*problem.beams.shape, -1) for part in parts]
     return np.stack(shaped, -1) if problem.color_jobs else shaped[0]
+
+
+def _as_long(parts: Sequence[Histograms]) -> list[Histograms]:
+    """Return histograms (n, bins), all with the bins of the longest: a channel in which the object
+    is black ends with its direct returns.
+    """
+    bins = max(part.shape[1] for part in parts)
+    return [np.pad(part, [(0, 0), (0, bins - part.shape[1])]) for part in parts]
 
 
 @dataclass(frozen=True)
@@ -180,7 +190,14 @@ def three_bounce(
     all.
     """
     problem = prepare(scene, accuracy_named(accuracy), effects, bounded=False)
-    return beam_histograms(problem, problem.job, backend, chosen)
+    if not problem.mixes_colors:
+        return beam_histograms(problem, problem.job, backend, chosen)
+    return _mean([beam_histograms(problem, job, backend, chosen) for job in problem.color_jobs])
+
+
+def _mean(parts: Sequence[Histograms]) -> Histograms:
+    """Return the mean of histograms (n, bins) of several lengths."""
+    return np.stack(_as_long(parts)).mean(0, dtype=parts[0].dtype)
 
 
 def beam_histograms(
@@ -189,8 +206,8 @@ def beam_histograms(
     backend: str,
     chosen: NDArray[np.int64] | None = None,
 ) -> Histograms:
-    """Return the three-bounce histograms of a problem's beams, or of the chosen; 0 for beams that
-    miss the wall.
+    """Return the three-bounce histograms of a job's beams, or of the chosen; 0 for beams that miss
+    the wall.
     """
     _check_backend(backend)
     lit = problem.beams.on_wall
@@ -236,6 +253,10 @@ def _echoes(problem: RenderProblem, backend: str) -> MultiBounce:
     can do that.
     """
     job = problem.job
+    if problem.mixes_colors:
+        parts = [transport(one, backend) for one in problem.color_jobs]
+        lit = [part for part in parts if part is not None]
+        return _strongest(problem, _mean(lit) if lit else None)
     # A pulse mixes neighbouring bins, so that the strongest bin before it may not be the strongest
     # after it: only a waveform without one may be summed in part.
     if backend == "cpu" and job and job.accuracy.sub_bins and not problem.includes("pulse"):
@@ -247,7 +268,8 @@ def _echoes_of_all(
     problems: Sequence[RenderProblem], accuracy: Accuracy, backend: str
 ) -> Iterable[MultiBounce]:
     """Return the strongest bins of every problem, torch's in one batch."""
-    if backend not in {"torch", "cuda"} or accuracy.sub_bins == 0:
+    mixed = any(problem.mixes_colors for problem in problems)
+    if backend not in {"torch", "cuda"} or accuracy.sub_bins == 0 or mixed:
         return [_echoes(problem, backend) for problem in problems]
     from nlos_cam.render import backend_torch
 
@@ -315,7 +337,7 @@ def _waveforms(problem: RenderProblem, histograms: Histograms) -> Float32:
     # each echo's own. What the pulse's tail carries beyond the gate is cut off.
     whole = add_direct(histograms.astype(np.float32, copy=False), problem.beams, device.bin_m)
     if problem.includes("pulse"):
-        whole = with_pulse(whole, problem.scene.pulse_ns, device.bin_m)
+        return with_pulse(whole, problem.scene.pulse_ns, device.bin_m, gate_bins(device))
     return whole[:, : gate_bins(device)]
 
 

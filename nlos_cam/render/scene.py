@@ -24,7 +24,7 @@ gigabytes in `fine`.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # arrays have no single truth value
 class Scene:
     """Scene at one instant. Raises SceneError if the object cannot be rendered."""
 
@@ -84,13 +84,17 @@ class Scene:
         """
         if self.object_depth_m is None or np.isnan(self.object_depth_m).all():
             return None
-        # Light is linear in albedo, so the mean of the channels renders their mean.
+        # Light of three bounces is linear in albedo: the mean of the channels renders their mean.
         every = self.surface.over(self.object_depth_m.shape)
         albedo = every.mean(-1) if channel is None else every[..., channel]
         return make_patches(self.object_depth_m.astype(np.float64), self.box, albedo, self.jump_m)
 
 
 def _check_depth(depth: Float32) -> None:
+    if not isinstance(depth, np.ndarray):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise SceneError(
+            f"object depth is a {type(depth).__name__}: give an array, as numpy.array makes it"
+        )
     if depth.ndim != 2 or depth.shape[0] != depth.shape[1] or not 1 <= len(depth) <= FINEST_GRID:
         raise SceneError(
             f"object depth has shape {depth.shape}: it must be (n, n) with n from 1 to"

@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,8 @@ from rich.progress import Progress
 
 from nlos_cam.cli.dataset import Rate
 from nlos_cam.dataset import DatasetPlan, RigSpread, build, open_dataset, read_head
-from nlos_cam.objects import CATEGORIES, TEXTURES
+from nlos_cam.dataset.samples import hidden_object
+from nlos_cam.objects import CATEGORIES, TEXTURES, object_box
 from nlos_cam.recording import ReplayCamera, SidecarFile, sidecar_path
 
 Run = Callable[..., Any]
@@ -95,6 +97,39 @@ def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path, built:
     )
     assert " --without 'hat, boat' " in _command(folder)
     assert _command(folder).endswith(" --workers 1 --backend cpu")
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("--rig-spread-mm", "inf"),
+        ("--rig-spread-deg", "inf"),
+        ("--gain-spread-percent", "inf"),
+        ("--up", "z"),
+    ],
+)
+def test_build_refuses_spreads_without_end_and_an_axis_of_no_mesh(
+    tmp_path: Path, run: Run, option: str, value: str
+) -> None:
+    refused = run("dataset", "build", "--out", tmp_path / "d", "--count", 1, option, value, code=2)
+
+    assert option in refused.err
+
+
+def test_build_turns_the_meshes_of_a_folder_upright(tmp_path: Path, built: Run) -> None:
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    trimesh.creation.cone(0.3, 1.0).export(meshes / "cone.stl")
+    built(tmp_path / "d", "--objects", str(meshes), "--up", "z")
+    lying = open_dataset(tmp_path / "d").plan.objects
+    standing = replace(lying, up="y")
+    (_, one), (_, other) = (
+        hidden_object(replace(each, folder=meshes), 3, object_box(load_rig("paper-rig")))
+        for each in (lying, standing)
+    )
+
+    assert lying.up == "z"
+    assert not np.array_equal(one, other, equal_nan=True)
 
 
 def test_build_interrupted_at_transients_says_what_it_kept(

@@ -70,7 +70,7 @@ def test_plan_writes_later_fields_only_where_used() -> None:
     facts = json.loads(PLAN.provenance)
 
     assert not {"textures", "note", "expected", "objects_per_rig"} & facts.keys()
-    assert "share_generic" not in facts["objects"]
+    assert not {"share_generic", "up"} & facts["objects"].keys()
 
 
 def test_textured_plan_carries_a_note() -> None:
@@ -84,6 +84,13 @@ def test_plan_writes_share_of_generic_shapes() -> None:
 
     assert json.loads(mixed.provenance)["objects"]["share_generic"] == 0.5
     assert DatasetPlan.from_provenance(mixed.provenance) == mixed
+
+
+def test_plan_writes_the_axis_of_meshes_that_lie() -> None:
+    lying = replace(PLAN, objects=Objects((), (("a.stl", "0"),), up="z"))
+
+    assert json.loads(lying.provenance)["objects"]["up"] == "z"
+    assert DatasetPlan.from_provenance(lying.provenance) == lying
 
 
 @pytest.fixture

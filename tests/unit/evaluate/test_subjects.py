@@ -16,6 +16,7 @@ from small_maps import SmallDataset, small_maps
 
 from nlos_cam.camera.simulated_world import World
 from nlos_cam.dataset import (
+    HELD_OUT_SEED,
     TEST_SEED,
     TRAINING_SEED,
     DatasetPlan,
@@ -166,11 +167,11 @@ def test_each_object_of_many_rigs_is_aligned_from_its_own(
 
 
 def test_note_says_that_objects_have_rigs_of_their_own(of_many_rigs: HeldOutObjects) -> None:
-    (note,) = notes_about(RECORD, of_many_rigs, None)
-    any_rig = replace(of_many_rigs, plan=DatasetPlan(RIG, 0, rigs=RigRange()))
+    notes = notes_about(RECORD, of_many_rigs, None)
+    any_rig = replace(of_many_rigs, plan=DatasetPlan(RIG, TEST_SEED, rigs=RigRange()))
     (other,) = notes_about(RECORD, any_rig, None)
 
-    assert "a rig of its own" in note
+    assert "a rig of its own" in notes[0]
     assert "a rig of its own" in other
 
 
@@ -243,6 +244,13 @@ def test_rig_of_a_benchs_weights_is_in_their_record() -> None:
 def test_unknown_rig_of_weights_is_asked_for() -> None:
     with pytest.raises(SceneError, match=r"'my bench'.*--rig"):
         rig_of(RECORD.model_copy(update={"rig_name": "my bench"}))
+
+
+def test_note_says_that_objects_have_seeds_of_training() -> None:
+    (note,) = notes_about(RECORD, replace(JUDGED, plan=DatasetPlan(RIG, 3)), None)
+
+    assert "may have seen them" in note
+    assert notes_about(RECORD, replace(JUDGED, plan=DatasetPlan(RIG, HELD_OUT_SEED)), None) == []
 
 
 def test_notes_are_none_where_rigs_are_the_same() -> None:

@@ -24,6 +24,7 @@ from nlos_cam.objects.depth_map import cell_centers_m, object_box, orthographic_
 from nlos_cam.objects.meshes import (
     POSES,
     MeshFile,
+    check_visible,
     folder_objects,
     mesh_depth,
     plain,
@@ -523,8 +524,11 @@ def test_mesh_depth_names_a_broken_or_invisible_mesh(tmp_path: Path) -> None:
         [[0, 1, 2]],
         process=False,
     )
+    path = _save(tmp_path / "needle.ply", needle)
     with pytest.raises(SceneError, match=r"needle\.ply"):
-        mesh_depth(0, [_save(tmp_path / "needle.ply", needle)], BOX, read=read_mesh)
+        mesh_depth(0, [path], BOX, read=read_mesh)
+    with pytest.raises(SceneError, match=r"needle\.ply"):
+        check_visible(read_mesh(path), BOX)
 
 
 def test_mesh_depth_draws_another_pose_for_an_edge_on_sheet(
@@ -690,6 +694,16 @@ def test_mesh_sampled_at_cell_centers_is_the_depth_map(depth_m: np.ndarray, jump
     )
 
     assert (normal[:, 2] < 0).all(), "the lit side faces the wall"
+
+
+def test_map_of_one_cell_becomes_a_square_over_the_box() -> None:
+    mesh = mesh_from_depth(np.full((1, 1), 0.2, np.float32), SMALL_BOX)
+    sides_m = np.ptp(mesh.vertices_m[:, :2], axis=0)
+
+    assert len(mesh.faces) == 2
+    np.testing.assert_allclose(
+        sides_m, [SMALL_BOX.x_max_m - SMALL_BOX.x_min_m, SMALL_BOX.y_max_m - SMALL_BOX.y_min_m]
+    )
 
 
 def test_vertices_lie_at_cell_centers_with_their_uncertainty() -> None:

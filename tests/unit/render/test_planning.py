@@ -12,7 +12,7 @@ from nlos_calibration import Occluder, load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import object_box, object_depth
-from nlos_cam.render import Radiometry, Scene, Surface, backend_reference, phong
+from nlos_cam.render import Radiometry, Scene, Surface, backend_reference, phong, planning
 from nlos_cam.render.accuracy import (
     MAX_BEAMS_PER_CELL,
     MAX_RELAY_CELLS,
@@ -131,11 +131,11 @@ def test_problem_without_interreflection_is_shorter() -> None:
     assert job.bins < _without().job.bins
 
 
-def test_problem_without_brdf_takes_the_middle_of_its_range() -> None:
+def test_problem_without_brdf_gives_back_as_much_light() -> None:
     job = _without("brdf").job
 
     assert job.brdf is None
-    assert job.patches.albedo.mean() == pytest.approx(0.6 * (0.5 + 0.5 + 0.5 * 2.5) / 2)
+    assert job.patches.albedo.mean() == pytest.approx(0.6 * (0.5 + 0.5))
 
 
 def test_prepare_refuses_histograms_that_do_not_fit() -> None:
@@ -143,6 +143,16 @@ def test_prepare_refuses_histograms_that_do_not_fit() -> None:
     scene = Scene(RIG.model_copy(update={"device": device}), DEPTH)
     with pytest.raises(SceneError, match="GiB"):
         prepare(scene, COARSE)
+
+
+def test_prepare_counts_the_bins_of_the_pulse(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene(RIG, DEPTH)
+    bins = prepare(scene, COARSE).job
+    monkeypatch.setattr(planning, "MAX_BYTES", 4 * len(bins.laser_spot_m) * bins.bins)
+
+    assert prepare(scene, COARSE).job.bins == bins.bins
+    with pytest.raises(SceneError, match="GiB"):
+        prepare(replace(scene, pulse_ns=10.0), COARSE)
 
 
 @pytest.mark.parametrize("radiometry", ["paper", "lambertian"])

@@ -1,5 +1,6 @@
 """Renderings, echoes, the rolling scan, BRDF tables and the numba backend (laws: tests/laws)."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -25,6 +26,7 @@ from nlos_cam.render import (
     prepare,
     render,
     render_all,
+    retroreflective,
     three_bounce,
     transient,
 )
@@ -34,6 +36,7 @@ from nlos_cam.render.echoes import MultiBounce, compete, no_echoes, strongest, w
 from nlos_cam.render.effects import Effect
 from nlos_cam.render.geometry import Beams
 from nlos_cam.render.job import TransportJob
+from nlos_cam.render.material import Brdf
 from nlos_cam.render.renderer import render_scan, scan_effect, slices
 from nlos_cam.render.scene import Radiometry
 
@@ -135,6 +138,58 @@ def test_mean_of_the_channels_is_the_intensity(pulse_ns: float) -> None:
     np.testing.assert_allclose(rendering.color.mean(-1), rendering.intensity, rtol=1e-5, atol=1e-30)
 
 
+def _valley() -> np.ndarray:
+    """Return two slopes that light each other."""
+    column = np.abs(np.arange(8) - 3.5)
+    return np.tile(0.2 + 0.015 * column, (8, 1)).astype(np.float32)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "torch"])
+def test_mean_of_the_channels_is_the_light_that_met_the_object_twice(backend: str) -> None:
+    """It is quadratic in albedo: the mean of the channels' albedos would give less."""
+    scene = Scene(RIG, _valley(), Surface(np.array([1.0, 0.2, 0.0])), "lambertian", jump_m=0.5)
+    named = ["direct", "three-bounce", "colour", "inter-reflection"]
+    grey = replace(scene, surface=Surface(0.4))
+
+    rendering = next(render_all([scene], COARSE, named, backend))
+    white = three_bounce(scene, COARSE, named, backend)
+    channels = transient(scene, COARSE, named, backend)
+    without_direct = [name for name in named if name != "direct"]
+    lit = transient(scene, COARSE, without_direct, backend)
+
+    np.testing.assert_allclose(rendering.color.mean(-1), rendering.intensity, rtol=1e-5, atol=1e-30)
+    assert white.sum() == pytest.approx(float(lit.mean(-1).sum()), rel=1e-4)
+    assert white.sum() > 1.01 * three_bounce(grey, COARSE, named, backend).sum()
+    assert channels.shape[-1] == 3
+
+
+def test_transient_of_a_channel_without_light_is_as_long() -> None:
+    """Nothing blocks the lidar here, and no beam meets the wall past the object."""
+    box = RIG.object_box.model_copy(update={"x_min_m": 0.1, "x_max_m": 1.1})
+    lidar = RIG.lidar.model_copy(update={"distance_m": 0.5, "yaw_deg": 60.0})
+    bench = RIG.model_copy(update={"object_box": box, "lidar": lidar, "occluder": None})
+    near = np.full((4, 4), 0.02, np.float32)
+
+    light = transient(Scene(bench, near, Surface(np.array([1.0, 1.0, 0.0]))), COARSE)
+
+    assert light.shape[-1] == 3
+    assert light[..., 2].sum() < light[..., 0].sum()
+
+
+@pytest.mark.parametrize("kind", [phong, retroreflective])
+@pytest.mark.parametrize("exponent", [20.0, 2000.0])
+def test_surface_whose_lobe_is_left_out_gives_back_as_much(
+    kind: Callable[[float, float, float], Brdf], exponent: float
+) -> None:
+    glossy = Scene(RIG, DEPTH, Surface(0.5, kind(0.3, 0.5, exponent)))
+    matt = Scene(RIG, DEPTH, Surface(0.5 * 0.8))
+    named = ["direct", "three-bounce"]
+
+    np.testing.assert_allclose(
+        three_bounce(glossy, COARSE, named), three_bounce(matt, COARSE, named), rtol=1e-6
+    )
+
+
 @pytest.mark.parametrize(
     ("surface", "backend"),
     [(Surface(), "cpu"), (Surface(1.0, phong(0.5, 0.5, 20)), "cpu"), (Surface(), "torch")],
@@ -164,6 +219,14 @@ def test_pulse_spreads_some_rows_at_a_time_as_all(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(echoes_module, "TRANSFORM_VALUES", 2 * whole.shape[1])
 
     np.testing.assert_array_equal(with_pulse(light, 1.0, BIN_M), whole)
+
+
+@pytest.mark.parametrize("at_most", [1, 60, 65, 1000])
+def test_pulse_up_to_a_bin_is_the_beginning_of_the_whole(at_most: int) -> None:
+    light = np.random.default_rng(0).random((3, 60), np.float32)
+    whole = with_pulse(light, 1.0, BIN_M)
+
+    np.testing.assert_array_equal(with_pulse(light, 1.0, BIN_M, at_most), whole[:, :at_most])
 
 
 BIN_M = 0.01

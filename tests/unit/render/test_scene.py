@@ -51,6 +51,7 @@ def _depth(z_m: float = 0.25, cells: int = 8) -> np.ndarray:
             for value in (-1e-9, np.inf, np.nan)
         ],
         ({"radiometry": "gothic"}, "gothic"),
+        ({"object_depth_m": [[0.2] * 8] * 8}, "list"),
         (
             {
                 "object_depth_m": _depth(),
@@ -64,6 +65,14 @@ def _depth(z_m: float = 0.25, cells: int = 8) -> np.ndarray:
 def test_scene_refuses_values_that_cannot_be(fields: dict[str, Any], word: str) -> None:
     with pytest.raises(SceneError, match=word):
         Scene(**{"rig": RIG} | fields)
+
+
+def test_scenes_are_equal_to_themselves_alone() -> None:
+    scene = Scene(RIG, _depth())
+
+    assert scene == scene  # noqa: PLR0124  arrays have no single truth value
+    assert scene != Scene(RIG, _depth())
+    assert len({scene, scene}) == 1
 
 
 def test_scene_has_patches_where_an_object_is() -> None:
@@ -89,6 +98,7 @@ def test_scene_has_patches_where_an_object_is() -> None:
         np.nan,
         np.inf,
         np.array([0.5, 2.0, 0.5]),
+        "white",
         np.ones(2),
         np.ones((4, 4, 2)),
         np.ones((1, 4, 4, 3)),
