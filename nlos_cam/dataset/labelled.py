@@ -65,8 +65,8 @@ def truth_depth_m(recording: Path, label: str, rig: Rig, known: Mapping[str, Flo
         return known[label]
     raise RecordingError(
         f"{recording} has the label {label!r}, which is not a benchmark object (such as"
-        f" {next(iter(known), 'cup-1')}), and no file describes it: add {label}{shapes.TRUTH_SUFFIX}"
-        f" (object, pose) or a depth map {label}{shapes.DEPTH_MAP_SUFFIX}"
+        f" {next(iter(known), 'cup-1')}), and no file describes it: add"
+        f" {label}{shapes.TRUTH_SUFFIX} (object, pose) or a depth map {label}{shapes.DEPTH_MAP_SUFFIX}"
     )
 
 
@@ -93,8 +93,8 @@ def _truth_file(folder: Path, name: str) -> Path | None:
         )
     if not found and (meshes := _meshes(folder, name)):
         raise RecordingError(
-            f"{meshes[0]} has no pose in the object box: write {name}{shapes.TRUTH_SUFFIX} beside it, with"
-            " size_m, x_m, y_m, front_m and its angles"
+            f"{meshes[0]} has no pose in the object box: write {name}{shapes.TRUTH_SUFFIX} beside"
+            " it, with size_m, x_m, y_m, front_m and its angles"
         )
     return found[0] if found else None
 

@@ -270,8 +270,8 @@ def shipped_iou(rig: Rig, weights: Path) -> float | None:
 
 
 def _shipped_iou(rig: Rig, name: str) -> float | None:
-    """Return the silhouette IoU that can be expected of shipped weights on a rig with an occluder: 0
-    where they do not serve it, None beyond the rigs that LOSSES or ANY_GAINS are fitted to.
+    """Return the silhouette IoU that can be expected of shipped weights on a rig with an occluder:
+    0 where they do not serve it, None beyond the rigs that LOSSES or ANY_GAINS are fitted to.
     """
     trained = load_record(shipped_folder(name))
     service = weights_serve(rig, trained).service
