@@ -411,10 +411,17 @@ def _occluder_position(
 
 def _move_between(occluder: Occluder, box: ObjectBox | None) -> str:
     """Return what to move so that the occluder stands between lidar and object."""
-    if box and box.x_min_m < MIN_PLACE_M:
-        by_cm = at_least(100.0 * (PAPER_X_M - box.x_min_m))
-        return f"move the object {by_cm} cm away from the lidar, along the wall"
-    place_m = min(PAPER_X_M, box.x_min_m - CLEAR_M) if box else PAPER_X_M
+    if not box or box.x_min_m >= MIN_PLACE_M:
+        return _move_to(occluder, min(PAPER_X_M, box.x_min_m - CLEAR_M) if box else PAPER_X_M)
+    by_cm = at_least(100.0 * (PAPER_X_M + CLEAR_M - box.x_min_m))
+    moved = f"move the object {by_cm} cm away from the lidar, along the wall"
+    if 0.0 < occluder.x_m <= PAPER_X_M:
+        return moved
+    return f"{moved}, and {_move_to(occluder, PAPER_X_M)}"
+
+
+def _move_to(occluder: Occluder, place_m: float) -> str:
+    """Return by how much to move the occluder to a place along the wall."""
     way = "away from" if occluder.x_m < place_m else "towards"
     by_cm = at_least(100.0 * abs(occluder.x_m - place_m))
     papers = "the paper's " if place_m == PAPER_X_M else ""

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 import nlos_models as models
 import typer
+from nlos_calibration import ObjectBox
 from rich.progress import ProgressColumn, Task
 from rich.text import Text
 
@@ -219,10 +220,12 @@ def build(
     spread = data.RigSpread(
         place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100
     )
+    bare = renderer.load_scene(scene) if scene else renderer.SceneFile(name="bare", rig=its_rig)
+    box = shapes.object_box(bare.rig)
     plan = data.DatasetPlan.of_scene(
-        renderer.load_scene(scene) if scene else renderer.SceneFile(name="bare", rig=its_rig),
+        bare,
         seed,
-        objects=_objects(objects, without, backgrounds, share_generic, up),
+        objects=_objects(objects, without, backgrounds, share_generic, up, box),
         accuracy=renderer.accuracy_named(accuracy).name,
         spread=spread,
         textures=tuple(shapes.TEXTURES) if colour else (),
@@ -358,6 +361,7 @@ def _objects(
     backgrounds: float,
     share_generic: float,
     up: shapes.Up | None,
+    box: ObjectBox,
 ) -> data.Objects:
     if objects == PROCEDURAL:
         if up:
@@ -369,8 +373,8 @@ def _objects(
             "--without and --backgrounds are for procedural objects: drop them"
         )
     with common.tracked("reading meshes") as on_progress:
-        meshes = data.objects_from_folder(Path(objects), on_progress)
-    return replace(meshes, share_generic=share_generic, up=up or "y")
+        meshes = data.objects_from_folder(Path(objects), box, up or "y", on_progress)
+    return replace(meshes, share_generic=share_generic)
 
 
 class Rate(ProgressColumn):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nlos_calibration import ObjectBox, Rig, load_rig
+from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
 from numpy.typing import NDArray
 
@@ -262,12 +262,14 @@ MAX_NAMED = 10
 """Broken meshes that one error names."""
 
 
-def objects_from_folder(folder: Path, on_progress: OnProgress = ignore) -> Objects:
-    """Read the meshes of a folder and its subfolders. Raises SceneError for none, or one that
-    cannot be used: once shards are written, the folder must stay as it is.
+def objects_from_folder(
+    folder: Path, box: ObjectBox, up: shapes.Up = "y", on_progress: OnProgress = ignore
+) -> Objects:
+    """Read the meshes of a folder and its subfolders, with the axis `up` upwards. Raises SceneError
+    for none, or one that shows nothing in a box or cannot be used: once shards are written, the
+    folder must stay as it is.
     """
     paths = shapes.folder_objects(folder)
-    box = shapes.object_box(load_rig("paper-rig"))
     meshes = list[tuple[str, str]]()
     problems = list[SceneError]()
     for number, path in enumerate(paths, start=1):
@@ -278,7 +280,7 @@ def objects_from_folder(folder: Path, on_progress: OnProgress = ignore) -> Objec
             raise SceneError(f"the name of the mesh {name!a} is not UTF-8: rename it") from error
         try:
             mesh = shapes.read_mesh(path)
-            shapes.check_visible(mesh, box)
+            shapes.check_visible(mesh, box, up)
             meshes.append((name, mesh.sha256))
         except SceneError as error:
             problems.append(error)
@@ -291,7 +293,7 @@ def objects_from_folder(folder: Path, on_progress: OnProgress = ignore) -> Objec
         raise SceneFileError(
             f"{len(problems)} of {len(paths)} meshes in {folder} cannot be used: {named}{more}"
         )
-    return Objects((), tuple(meshes), folder=folder.resolve())
+    return Objects((), tuple(meshes), up=up, folder=folder.resolve())
 
 
 @lru_cache(maxsize=16)

@@ -273,14 +273,10 @@ def _triangles_of(content: bytes, suffix: str) -> Float64:
         return _ply_polygons(content)
     parts = _parts(content, suffix)
     triangles = np.concatenate([np.empty((0, 3, 3)), *(_triangles(part) for part in parts)])
-    if suffix == ".ply":
-        faces = _ply_face_count(content)
-        if len(triangles) > faces:  # the parser cut polygons as fans
-            return _ply_polygons(content)
-        if (
-            len(triangles) < faces
-        ):  # of a text file that is cut short, the parser takes what is left
-            raise _MeshProblemError(f"it has {len(triangles)} of {faces} faces")
+    # More triangles than faces: the parser cut polygons as fans. Fewer: some faces have no three
+    # corners, or a text file is cut short, of which the parser takes what is left.
+    if suffix == ".ply" and len(triangles) != _ply_face_count(content):
+        return _ply_polygons(content)
     return triangles
 
 
@@ -377,9 +373,9 @@ def mesh_depth(
     return picked, _posed_depth(read(picked), box, up, generator)
 
 
-def check_visible(mesh: MeshFile, box: ObjectBox) -> None:
+def check_visible(mesh: MeshFile, box: ObjectBox, up: Up = "y") -> None:
     """Raise SceneError for a mesh that shows no surface in any of POSES poses in a box."""
-    _posed_depth(mesh, box, "y", np.random.default_rng(0))
+    _posed_depth(mesh, box, up, np.random.default_rng(0))
 
 
 def _posed_depth(mesh: MeshFile, box: ObjectBox, up: Up, generator: np.random.Generator) -> Float32:

@@ -138,7 +138,10 @@ def _as_long(parts: Sequence[Histograms]) -> list[Histograms]:
     is black ends with its direct returns.
     """
     bins = max(part.shape[1] for part in parts)
-    return [np.pad(part, [(0, 0), (0, bins - part.shape[1])]) for part in parts]
+    return [
+        part if part.shape[1] == bins else np.pad(part, [(0, 0), (0, bins - part.shape[1])])
+        for part in parts
+    ]
 
 
 @dataclass(frozen=True)
@@ -192,12 +195,19 @@ def three_bounce(
     problem = prepare(scene, accuracy_named(accuracy), effects, bounded=False)
     if not problem.mixes_colors:
         return beam_histograms(problem, problem.job, backend, chosen)
-    return _mean([beam_histograms(problem, job, backend, chosen) for job in problem.color_jobs])
+    return _mean(beam_histograms(problem, job, backend, chosen) for job in problem.color_jobs)
 
 
-def _mean(parts: Sequence[Histograms]) -> Histograms:
-    """Return the mean of histograms (n, bins) of several lengths."""
-    return np.stack(_as_long(parts)).mean(0, dtype=parts[0].dtype)
+def _mean(parts: Iterable[Histograms]) -> Histograms:
+    """Return the mean of histograms (n, bins) of several lengths; one is held beside the sum."""
+    rest = iter(parts)
+    total = next(rest)
+    count = 1
+    for part in rest:
+        total, longer = _as_long([total, part])
+        total = total + longer
+        count += 1
+    return total / count
 
 
 def beam_histograms(
@@ -253,10 +263,9 @@ def _echoes(problem: RenderProblem, backend: str) -> MultiBounce:
     can do that.
     """
     job = problem.job
-    if problem.mixes_colors:
-        parts = [transport(one, backend) for one in problem.color_jobs]
-        lit = [part for part in parts if part is not None]
-        return _strongest(problem, _mean(lit) if lit else None)
+    if problem.mixes_colors and job is not None:  # then the channels' jobs are not None either
+        every = (transport(one, backend) for one in problem.color_jobs)
+        return _strongest(problem, _mean(one for one in every if one is not None))
     # A pulse mixes neighbouring bins, so that the strongest bin before it may not be the strongest
     # after it: only a waveform without one may be summed in part.
     if backend == "cpu" and job and job.accuracy.sub_bins and not problem.includes("pulse"):

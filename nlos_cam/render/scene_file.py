@@ -214,8 +214,8 @@ def one_wrap(faults: tuple[Fault, ...]) -> tuple[Fault, ...]:
 
 
 RENDERING_VERSION = 7
-"""Number to raise with any change of rendering results or of datasets' noise: cached worlds are
-rendered again, and datasets of another number are not continued.
+"""Number to raise where rendering results or datasets' noise differ from those of the last release:
+cached worlds are rendered again, and datasets of another number are not continued.
 """
 
 

@@ -130,19 +130,26 @@ def test_judge_rig_advises_on_a_misplaced_sheet(
 
 
 @pytest.mark.parametrize(
-    ("x_min_m", "cure"),
+    ("x_min_m", "sheet_m", "cure", "box_m", "place_m"),
     [
-        (0.02, "move the object 18 cm away from the lidar"),
-        (0.15, "move it 6 cm towards the lidar, to 0.14 m"),
+        (0.02, 0.2, "move the object 19 cm away from the lidar", 0.21, 0.2),
+        (0.02, 0.25, "19 cm away .*, and move it 5 cm towards the lidar", 0.21, 0.2),
+        (0.04, -0.03, "17 cm away .*, and move it 23 cm away from the lidar", 0.21, 0.2),
+        (0.15, 0.2, "move it 6 cm towards the lidar, to 0.14 m", 0.15, 0.14),
+        (0.3, 0.4, "move it 20 cm towards the lidar, to the paper's 0.20 m", 0.3, 0.2),
     ],
 )
-def test_judge_rig_makes_room_for_a_sheet_before_the_box(x_min_m: float, cure: str) -> None:
-    bench = rig().model_copy(
-        update={"object_box": BOX.model_copy(update={"x_min_m": x_min_m, "x_max_m": 0.4})}
-    )
-    (problem,) = problems(bench)
+def test_judge_rig_says_what_to_move_for_a_sheet_before_the_box(
+    x_min_m: float, sheet_m: float, cure: str, box_m: float, place_m: float
+) -> None:
+    def bench(sheet_m: float, x_min_m: float) -> Rig:
+        box = BOX.model_copy(update={"x_min_m": x_min_m, "x_max_m": x_min_m + 0.25})
+        return rig(sheet_m).model_copy(update={"object_box": box})
 
-    assert cure in problem
+    (problem,) = [one for one in problems(bench(sheet_m, x_min_m)) if "not between" in one]
+
+    assert re.search(cure, problem)
+    assert not any("not between" in one for one in problems(bench(place_m, box_m)))
 
 
 def test_judge_rig_says_that_a_bench_is_a_mirror_image() -> None:

@@ -261,38 +261,38 @@ def meshes(tmp_path: Path) -> Path:
 def test_objects_from_folder_are_its_meshes(meshes: Path) -> None:
     progress: list[tuple[int, int]] = []
 
-    objects = objects_from_folder(meshes, lambda *at: progress.append(at))
+    objects = objects_from_folder(meshes, BOX, on_progress=lambda *at: progress.append(at))
 
     assert progress == [(1, 2), (2, 2)]
     assert [name for name, _ in objects.meshes] == ["cube.stl", "sub/ball.ply"]
 
 
 def test_meshes_of_a_folder_are_hidden_by_seed(meshes: Path) -> None:
-    objects = objects_from_folder(meshes)
+    objects = objects_from_folder(meshes, BOX)
 
     found = _drawn(objects, 12)
 
     assert {name for name, _ in found} == {"cube.stl", "sub/ball.ply"}
 
-    again = hidden_object(objects_from_folder(meshes), 3, BOX)
+    again = hidden_object(objects_from_folder(meshes, BOX), 3, BOX)
 
     np.testing.assert_array_equal(again[1], found[3][1])
     assert make_samples(replace(PLAN, objects=objects), [0])["category"][0] == found[0][0]
 
 
 def test_meshes_are_identified_by_content_not_by_folder(meshes: Path) -> None:
-    before = objects_from_folder(meshes)
+    before = objects_from_folder(meshes, BOX)
     moved = meshes.rename(meshes.with_name("moved"))
 
-    assert objects_from_folder(moved) == before
+    assert objects_from_folder(moved, BOX) == before
 
     trimesh.creation.box((1, 2, 1)).export(moved / "cube.stl")
 
-    assert objects_from_folder(moved) != before
+    assert objects_from_folder(moved, BOX) != before
 
 
 def test_changed_mesh_is_refused(meshes: Path) -> None:
-    before = objects_from_folder(meshes)
+    before = objects_from_folder(meshes, BOX)
     trimesh.creation.box((1, 2, 1)).export(meshes / "cube.stl")
 
     with pytest.raises(SceneError, match=r"cube\.stl"):
@@ -301,19 +301,19 @@ def test_changed_mesh_is_refused(meshes: Path) -> None:
 
 def test_missing_folder_of_meshes_is_named(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=tmp_path.name):
-        objects_from_folder(tmp_path / "none")
+        objects_from_folder(tmp_path / "none", BOX)
 
 
 def test_meshes_without_their_folder_ask_for_it(meshes: Path) -> None:
     with pytest.raises(SceneError, match="--objects"):
-        hidden_object(replace(objects_from_folder(meshes), folder=None), 0, BOX)
+        hidden_object(replace(objects_from_folder(meshes, BOX), folder=None), 0, BOX)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes here")
 def test_objects_of_refuses_mesh_name_that_is_not_utf8(meshes: Path) -> None:
     (meshes / "cube.stl").rename(meshes / os.fsdecode(b"caf\xe9.stl"))
     with pytest.raises(SceneError, match="UTF-8"):
-        objects_from_folder(meshes)
+        objects_from_folder(meshes, BOX)
 
 
 def _sensed(depth_m: Float32, albedo: Float32, sensor: Sensor, seed: int = 0) -> LidarMaps:

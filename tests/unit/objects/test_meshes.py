@@ -230,7 +230,8 @@ def test_read_mesh_joins_parts_and_equals_by_path_and_content(tmp_path: Path) ->
         ("thing.glb", b"glTF", ".ply"),
         ("points.ply", trimesh.PointCloud(SQUARE).export(file_type="ply"), "faces"),
         ("short.stl", EXPORTS["text.stl"][:900], "faces"),
-        ("short.ply", PLY[: PLY.rindex(b"3 ")], "faces"),
+        ("short.ply", PLY[: PLY.rindex(b"3 ")], ""),
+        ("shorter.ply", PLY[: PLY.rindex(b"0 2 3")], ""),
         *[
             (name, content, "faces")
             for name, content in (
@@ -334,6 +335,15 @@ def test_read_mesh_raises_scene_errors_only_on_damage(
 )
 def test_plain_makes_odd_obj_text_usual(odd: bytes, usual: bytes) -> None:
     assert plain(odd, ".obj") == usual
+
+
+@pytest.mark.parametrize("odd", [b"0", b"1 0", b"2 0 1"])
+def test_face_without_three_corners_takes_no_other_with_it(tmp_path: Path, odd: bytes) -> None:
+    content = PLY.replace(b"element face 2", b"element face 3").replace(
+        b"3 0 2 3\n", odd + b"\n3 0 2 3\n"
+    )
+
+    assert len(_read(tmp_path, "odd.ply", content).triangles) == 2
 
 
 def test_plain_renames_ply_edges_and_keeps_binary_bodies() -> None:
