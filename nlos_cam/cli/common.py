@@ -87,6 +87,8 @@ class PlainConsole(Console):
 
 stderr = PlainConsole(stderr=True)
 _outputs = ExitStack()
+_interruptions: list[tuple[Event, str]] = []
+"""Event and text of each `interrupted_by_signals` that runs, the outermost first."""
 _reserved: list[Path] = []
 """Reserved output paths of the command that runs, and their reservations."""
 
@@ -259,6 +261,7 @@ def stop_on_signals(note: str = "", hurry: Event | None = None) -> Generator[Eve
 
     The first signal prints `note`, for loops whose end takes long; the next one sets `hurry`.
     """
+    _raise_swallowed()
     stop = Event()
 
     def set_stop() -> None:
@@ -278,9 +281,11 @@ def interrupted_by_signals(kept: str = "nothing was written") -> Generator[None]
     """Raise KeyboardInterrupt in the block on Ctrl-C, SIGTERM or SIGHUP; the first two also
     where a shell had them ignored.
 
-    It is raised at the end of the block too: a library may have swallowed it or turned it into
-    another error. `kept` completes the line "interrupted: ...", which the command line prints.
+    It is raised at the end of the block too, and where a block begins within: a library may have
+    swallowed it or turned it into another error. `kept` completes the line "interrupted: ...",
+    which the command line prints.
     """
+    _raise_swallowed()
     interrupted = Event()
 
     def interrupt() -> None:
@@ -296,14 +301,26 @@ def interrupted_by_signals(kept: str = "nothing was written") -> Generator[None]
             before(ignored)
 
     with _on_signals(interrupt), _unraisable_hook(raise_again):
+        _interruptions.append((interrupted, kept))
         try:
             yield
         except Exception as error:
             if interrupted.is_set():
                 raise KeyboardInterrupt(kept) from error
             raise
+        finally:
+            _interruptions.pop()
     if interrupted.is_set():
         raise KeyboardInterrupt(kept)
+
+
+def _raise_swallowed() -> None:
+    """Raise the interruption of a block around this place that a library has swallowed: the work
+    to come may have no end.
+    """
+    for interrupted, kept in _interruptions:
+        if interrupted.is_set():
+            raise KeyboardInterrupt(kept)
 
 
 @contextmanager

@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
+import nlos_calibration as walls
 import nlos_models as models
 import typer
-from nlos_calibration import ObjectBox
 from rich.progress import ProgressColumn, Task
 from rich.text import Text
 
@@ -361,7 +361,7 @@ def _objects(
     backgrounds: float,
     share_generic: float,
     up: shapes.Up | None,
-    box: ObjectBox,
+    box: walls.ObjectBox,
 ) -> data.Objects:
     if objects == PROCEDURAL:
         if up:

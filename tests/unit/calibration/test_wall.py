@@ -340,7 +340,7 @@ def test_tape_offset_is_added_to_depth_that_is_too_short(yaw_deg: float, offset_
 @pytest.mark.parametrize(
     ("yaw_deg", "offset_m"), [(45.0, 0.02), (70.0, 0.013), (75.0, 0.009), (75.0, 0.013)]
 )
-def test_tape_offset_of_depth_is_found_where_the_origins_is_too_large(
+def test_tape_offset_of_depth_is_found_where_the_origins_is_not(
     yaw_deg: float, offset_m: float
 ) -> None:
     """On an oblique wall an origin would have to be up to three times as far off."""

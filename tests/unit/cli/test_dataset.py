@@ -108,7 +108,7 @@ def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path, built:
         ("--up", "z"),
     ],
 )
-def test_build_refuses_spreads_without_end_and_an_axis_of_no_mesh(
+def test_build_refuses_endless_spreads_and_an_axis_of_no_mesh(
     tmp_path: Path, run: Run, option: str, value: str
 ) -> None:
     refused = run("dataset", "build", "--out", tmp_path / "d", "--count", 1, option, value, code=2)

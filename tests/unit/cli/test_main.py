@@ -12,7 +12,7 @@ import sys
 import time
 import weakref
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -421,6 +421,27 @@ def test_interruption_that_python_ignores_is_raised_again() -> None:
         lose_a_signal()
 
     assert sys.unraisablehook is hook
+
+
+@pytest.mark.parametrize("block", [common.interrupted_by_signals, common.stop_on_signals])
+def test_interruption_a_library_swallows_ends_the_next_block(
+    block: Callable[[], AbstractContextManager[object]],
+) -> None:
+    """Such as an import in which any error means that something is not installed. The next block
+    may be a live run without an end.
+    """
+
+    def swallow_and_go_on() -> None:
+        with common.interrupted_by_signals("kept"):
+            with suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+            with block():
+                pytest.fail("the interruption was lost")
+
+    with pytest.raises(KeyboardInterrupt, match="kept"):
+        swallow_and_go_on()
+    with block():
+        pass  # it is over
 
 
 @pytest.mark.parametrize(

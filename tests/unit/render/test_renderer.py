@@ -145,7 +145,7 @@ def _valley() -> np.ndarray:
 
 
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
-def test_mean_of_the_channels_is_the_light_that_met_the_object_twice(backend: str) -> None:
+def test_mean_of_the_channels_is_light_that_met_the_object_twice(backend: str) -> None:
     """It is quadratic in albedo: the mean of the channels' albedos would give less."""
     scene = Scene(RIG, _valley(), Surface(np.array([1.0, 0.2, 0.0])), "lambertian", jump_m=0.5)
     named = ["direct", "three-bounce", "colour", "inter-reflection"]
