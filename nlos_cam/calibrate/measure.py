@@ -208,7 +208,8 @@ def _fit_with_known_offset(
     uncertain too; return the fit and the record's range-offset fields.
     """
     offset_m = walls.depth_offset_m(known)
-    _raise_if_disturbed(capture, offset_m=offset_m)
+    if offset_m:  # without one the capture was checked as it is
+        _raise_if_disturbed(capture, offset_m=offset_m)
     fit = _fit_depth(capture, offset_m, known.range_offset_m - offset_m)
     # an origin that moves along the optical axis moves away from the wall by the cosine of that
     per_offset = cos(radians(fit.facing_deg))
