@@ -1,7 +1,8 @@
 """Physics with a prior: does a picture become better that also explains the light?
 docs/figures/physics.json and docs/images/physics.png.
 
-    python tools/studies/physics.py WORK [--objects N] [--sets NAMES ...] [--out DIR]
+    python tools/studies/physics.py WORK [--objects N] [--sets NAMES ...] [--ways NAMES ...]
+        [--settings FIGURES] [--name NAME] [--out DIR]
 
 Objects: the 54 of the kinds of training and the 54 of kinds never seen, maps of FRAMES averaged frames
 as `live` forms them, from one place (home), two (home and near) and four. Outline and depth over 32 x
@@ -18,7 +19,8 @@ as `live` forms them, from one place (home), two (home and near) and four. Outli
   in it, corrects each beam.
 
 How far the model is trusted, the share of the covariance and the weight of the depth's prior are
-chosen by the IoU of TUNING other objects, seen from home and near. Of the first two ways the figures
+chosen by the IoU of TUNING other objects, seen from home and near, or taken from an earlier run's
+figures (`--settings`). Of the first two ways the figures
 hold the light that the estimate, its start and the truth leave unexplained ("cost", of one echo).
 Where the truth costs more than the estimate, light and model do not distinguish them; where it costs
 less, the search has not found it. WORK keeps the figures of each object: a second call goes on.
@@ -48,6 +50,7 @@ from stations import PLACES, rig_at
 
 from nlos_cam.camera import World
 from nlos_cam.cli.common import tracked
+from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import (
     Subject,
     advantage,
@@ -713,6 +716,15 @@ def tuned(way: str, work: Path) -> Choice:
     return options[0] if len(options) == 1 else max(options, key=mean_iou)
 
 
+def chosen_earlier(way: str, figures: Path) -> Choice:
+    """Return what an earlier run chose for a way. Raises SceneError where it has no such way."""
+    rows = json.loads(figures.read_text(encoding="utf-8"))["rows"]
+    for row in rows:
+        if row["way"] == way:
+            return Choice(**row["choice"])
+    raise SceneError(f"{figures} has no settings of {way!r}: leave out --settings to tune them")
+
+
 def draw(rows: Sequence[Mapping[str, Any]], groups: Sequence[str]) -> Figure:
     """Draw each way's IoU over the number of places."""
     figure = Figure(figsize=(7.2, 3.2), layout="constrained")
@@ -736,15 +748,18 @@ def main() -> None:
     parser.add_argument("--objects", type=int, default=54, help="of each kind, at most 54")
     parser.add_argument("--sets", nargs="+", default=list(SETS), choices=SETS)
     parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=WAYS)
+    parser.add_argument("--settings", type=Path, help="figures whose settings to take")
+    parser.add_argument("--name", default="physics", help="of the results' files")
     parser.add_argument("--out", type=Path, help="folder of the results (default: docs)")
     asked = parser.parse_args()
-    harness.claim(asked.work)
+    harness.claim(asked.work, settings=asked.settings)
 
     box = object_box(load_rig("paper-rig"))
     groups = {"kinds of training": benchmark_objects, "kinds never seen": unseen_objects}
     rows = list[dict[str, Any]]()
     for way, places in product(asked.ways, asked.sets):
-        choice = tuned(way, asked.work)
+        earlier = asked.settings
+        choice = chosen_earlier(way, earlier) if earlier else tuned(way, asked.work)
         row: dict[str, Any] = {"way": way, "places": places, "choice": vars(choice)}
         for group, objects_in in groups.items():
             subjects = objects_in(box)[: asked.objects]
@@ -775,9 +790,9 @@ def main() -> None:
         "frames": FRAMES,
         "rows": rows,
     }
-    harness.write("physics", facts, asked.out)
+    harness.write(asked.name, facts, asked.out)
     if start and len(asked.ways) == len(WAYS):
-        harness.save("physics", draw(rows, list(groups)), asked.out)
+        harness.save(asked.name, draw(rows, list(groups)), asked.out)
 
 
 if __name__ == "__main__":
