@@ -102,21 +102,19 @@ def gain_by_doubling(curves: Sequence[Curve]) -> float | None:
 def outlook(
     plan: Plan, curves: Sequence[Curve], reached_iou: float, expected_iou: float | None
 ) -> str:
-    """Return in words what more minutes would bring, by the forecast where that is far, else by the
-    learning curve.
+    """Return in words what more minutes would bring by the learning curve, after the forecast where
+    that is far.
     """
-    if expected_iou is not None and reached_iou < expected_iou - SCATTER_IOU:
-        return (
-            f"The forecast for this bench is {expected_iou:.2f}: more minutes bring it nearer"
-            f" ({plan.minutes:.0f} so far)."
-        )
+    far = expected_iou is not None and reached_iou < expected_iou - SCATTER_IOU
+    forecast = f"The forecast for this bench is {expected_iou:.2f}. " if far else ""
     gain = gain_by_doubling(curves)
     if gain is None:
-        return "Too few epochs to say what more minutes would bring."
+        return f"{forecast}Too few epochs to say what more minutes would bring."
     minutes = f"{2 * plan.minutes:.0f} minutes in all"
+    rise = f"{gain:+.3f} of IoU"
     if gain < 0.005:
-        return f"More minutes bring little: {gain:+.3f} of IoU at {minutes}, by the learning curve."
-    return f"{minutes} would bring about {gain:+.3f} of IoU, by the learning curve."
+        return f"{forecast}More minutes bring little: {rise} at {minutes}, by the learning curve."
+    return f"{forecast}{minutes} would bring about {rise}, by the learning curve."
 
 
 def draw_curves(curves: Sequence[Curve]) -> bytes:

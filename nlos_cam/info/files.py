@@ -135,7 +135,8 @@ def describe_mesh(path: Path, _verify: bool) -> Description:
     from nlos_cam.objects import read_mesh
 
     if points := _points_alone(path):
-        return Description("point cloud", {"points": points}, checked="head")
+        problem = _missing_points(path)
+        return Description("point cloud", {"points": points}, problem=problem, checked="all of it")
     triangles = read_mesh(path).triangles
     corners = triangles.reshape(-1, 3)
     size = " x ".join(f"{side:.4g}" for side in np.ptp(corners, axis=0))
@@ -152,6 +153,17 @@ def _points_alone(path: Path) -> str:
     if not (head.startswith(b"ply") and end and vertices) or b"element face" in head:
         return ""
     return vertices[1].decode()
+
+
+def _missing_points(path: Path) -> str:
+    """Return what is missing of a .ply of points; empty if it is whole."""
+    import plyfile
+
+    try:
+        plyfile.PlyData.read(str(path), mmap=False)
+    except (plyfile.PlyParseError, ValueError):
+        return f"{path} is cut short or damaged: export it again"
+    return ""
 
 
 REPLAYED = "result of a replay"
@@ -457,10 +469,10 @@ def describe_log(path: Path, _verify: bool) -> Description | None:
         names = set(rows[0]) if rows else set[str]()
     if not {"frame_number", "published_s", "latency_ms"} <= names:
         return None
-    if not rows:
+    whole = [row for row in rows if row["latency_ms"] not in {None, ""}]
+    if not whole:
         return Description("log of a live run", {"frames": "0"}, "", "nlos-cam live")
 
-    whole = [row for row in rows if row["latency_ms"] not in {None, ""}]
     latency_ms = np.median([float(row["latency_ms"]) for row in whole])
     seconds = float(whole[-1]["published_s"]) - float(whole[0]["published_s"])
     facts = {"frames": str(len(rows)), "duration": f"{seconds:.1f} s"}

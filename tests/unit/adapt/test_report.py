@@ -77,11 +77,11 @@ def test_a_stage_of_few_samples_says_nothing_of_the_gain() -> None:
 
 
 @pytest.mark.parametrize(
-    ("expected_iou", "words"),
-    [(None, "2 minutes in all would bring about +0.020"), (0.9, "forecast for this bench is 0.90")],
+    ("expected_iou", "forecast"),
+    [(None, ""), (0.52, ""), (0.9, "The forecast for this bench is 0.90. ")],
 )
-def test_the_outlook_is_by_forecast_or_by_curve(
-    tmp_path: Path, expected_iou: float | None, words: str
+def test_the_outlook_is_the_curve_after_a_far_forecast(
+    tmp_path: Path, expected_iou: float | None, forecast: str
 ) -> None:
     job_in(tmp_path / "work", load_rig("paper-rig"))
     plan = load_plan(tmp_path / "work")
@@ -90,8 +90,8 @@ def test_the_outlook_is_by_forecast_or_by_curve(
 
     advice = outlook(plan, curves, 0.5, expected_iou)
 
-    assert words in advice
-    assert ("by the learning curve" in advice) is (expected_iou is None)
+    by_curve = "2 minutes in all would bring about +0.020 of IoU, by the learning curve."
+    assert advice == forecast + by_curve
 
 
 def figures_of(iou: float) -> dict[str, Any]:

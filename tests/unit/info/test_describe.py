@@ -180,6 +180,15 @@ def test_mesh_has_its_triangles_and_its_size(files: dict[str, Path]) -> None:
     assert describe(files["point cloud"]).facts == {"points": "3"}
 
 
+def test_points_that_were_cut_are_not_whole(files: dict[str, Path], tmp_path: Path) -> None:
+    content = files["point cloud"].read_bytes()
+    for name, kept in (("whole.ply", content), ("cut.ply", content[:-1])):
+        (tmp_path / name).write_bytes(kept)
+
+    assert describe(tmp_path / "whole.ply").problem == ""
+    assert "cut.ply is cut short" in describe(tmp_path / "cut.ply").problem
+
+
 def test_folder_of_frames_counts_each_ending(tmp_path: Path) -> None:
     for name in ("000001.ply", "000001-points.ply", "000003-2.ply", "1234567.csv"):
         (tmp_path / name).touch()
