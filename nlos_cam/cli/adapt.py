@@ -6,7 +6,7 @@ import os
 import shlex
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import nlos_calibration as walls
 import typer
@@ -37,6 +37,23 @@ MAX_MINUTES = 6000
 MAX_FRAMES = 10**8
 WORK = "adapt"
 WEIGHTS = "weights"
+
+
+class _Subject(NamedTuple):
+    """A bench, or a rig alone, that weights are made for."""
+
+    name: str
+    own: Path | None
+    """The bench's folder."""
+    folder: Path | None
+    """The same, where the bench shall use the weights."""
+    rig: walls.Rig
+    measured: walls.MeasuredWall | None
+
+    @property
+    def option(self) -> str:
+        """It as other commands take it."""
+        return f"{'--bench' if self.own else '--rig'} {shlex.quote(self.name)}"
 
 
 def adapt(
@@ -114,6 +131,7 @@ def adapt(
     own = Path(bench) if names_folder(bench) else None
     folder = own if out is None else None
     rig, measured = bench_or_rig(bench)
+    subject = _Subject(bench, own, folder, rig, measured)
     locked = _locked(frames, radiometry, material, given=pulse_ns is not None)
     home = out or folder or Path(f"adapted-{rig.name}")
     work = home / (LOCKED_WORK if locked else WORK)
@@ -154,23 +172,9 @@ def adapt(
         target = _install(result, folder, home / WEIGHTS)
     with common.interrupted_by_signals(f"the weights are in {target}; the page is not written"):
         expected = None if locked else _forecast(rig, folder)
-    name = shlex.quote(bench)
-    place = f"{'--bench' if own else '--rig'} {name}"
-    pictures = (
-        cameras.pictures_command(measured.record, place)
-        if measured
-        else f"nlos-cam live --camera l515 {place}"
-    )
-    if locked:
-        use = []
-    elif folder and kept:
-        use = [pictures]
-    elif folder and _has_weights_of_another_rig(folder):
-        use = [f"{pictures} --weights {shlex.quote(_better_weights(result, rig))}"]
-    else:
-        use = [f"nlos-cam evaluate {place} --weights {shlex.quote(str(target))}"]
+    use = [] if locked else [_use_command(subject, result, target, kept=kept)]
     more = _go_on_command(
-        name,
+        bench,
         min(2 * result.plan.minutes, MAX_MINUTES),
         {
             "--frames": locked and locked.frames,
@@ -189,9 +193,25 @@ def adapt(
     _report(result, target, [*use, more], work / PAGE, expected, kept=kept, as_json=json)
 
 
+def _use_command(
+    subject: _Subject, result: adaptation.AdaptResult, target: Path, *, kept: bool
+) -> str:
+    """Return the command that uses new weights, or the better ones that they do not replace."""
+    pictures = f"nlos-cam live --camera l515 {subject.option}"
+    if subject.measured:
+        pictures = cameras.pictures_command(subject.measured.record, subject.option)
+
+    if subject.folder and kept:
+        return pictures
+    if subject.folder and _has_weights_of_another_rig(subject.folder):
+        better = _better_weights(result, subject.rig)
+        return f"{pictures} --weights {shlex.quote(better)}"
+    return f"nlos-cam evaluate {subject.option} --weights {shlex.quote(str(target))}"
+
+
 def _go_on_command(bench: str, minutes: float, options: Mapping[str, Any]) -> str:
     """Return the command that goes on with more minutes, with the options that have a value."""
-    words = [f"nlos-cam adapt {bench} --minutes {minutes:g}"]
+    words = [f"nlos-cam adapt {shlex.quote(bench)} --minutes {minutes:g}"]
     words += [
         f"{option} {shlex.quote(str(value))}"
         for option, value in options.items()

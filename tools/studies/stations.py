@@ -18,7 +18,8 @@ import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -320,6 +321,56 @@ def draw(found: Mapping[str, Any]) -> Figure:
     return figure
 
 
+@dataclass(frozen=True)
+class Material:
+    """What networks are trained on and judged by."""
+
+    sources: Mapping[str, PackedMaps]
+    """Of each station."""
+    sets: Mapping[str, Maps]
+    recipe: DirectRecipe
+    folder: Path
+    compiled: bool
+
+    def values(self, name: str, seed: int) -> dict[str, Any]:
+        """Return the metrics of a network (stations joined by +), which is trained if the folder does
+        not have them.
+        """
+        folder = self.folder / f"{name}-{seed}"
+        done = folder / "judged.json"
+        if not done.exists():
+            stations = name.split("+")
+            network = trained(
+                stations,
+                [self.sources[each] for each in stations],
+                self.recipe.model_copy(update={"seed": seed}),
+                self.sets[TESTS[2]],
+                folder,
+                compiled=self.compiled,
+            )
+            done.write_text(json.dumps(judged(network, self.sets, stations)), encoding="utf-8")
+        return json.loads(done.read_text(encoding="utf-8"))
+
+
+def recipe_of(samples: int) -> DirectRecipe:
+    """Return the recipe of the study's networks. Raises SceneError where RECIPE is of another kind."""
+    recipe = load_recipe(RECIPE)
+    if not isinstance(recipe, DirectRecipe):
+        raise SceneError(f"{RECIPE} is no recipe of a direct network")
+    return recipe.model_copy(update={"epochs": EPOCHS, "objects": samples // EPOCHS})
+
+
+def packed(opened: ExitStack, folder: Path, store: Path, objects: int) -> PackedMaps:
+    """Return the maps of a station. Raises SceneError where they are of more or fewer objects."""
+    source = opened.enter_context(open_packed_maps([folder], store))
+    if len(source) != objects:  # an earlier call's, which the figures would be of
+        raise SceneError(
+            f"{folder} holds {len(source)} objects, not {objects}: ask for as many, or name an empty"
+            " WORK"
+        )
+    return source
+
+
 def main() -> None:
     """Run the study."""
     parser = harness.options(__doc__)
@@ -342,59 +393,30 @@ def main() -> None:
     }
     sets[TESTS[2]] = {place: held_out(place, asked.work) for place in places}
     torch.set_num_threads(threads)  # rendering set the number anew
-    recipe = load_recipe(RECIPE)
-    if not isinstance(recipe, DirectRecipe):
-        raise SceneError(f"{RECIPE} is no recipe of a direct network")
     runs: list[dict[str, Any]] = []
+    facts: dict[str, Any] = {
+        "machine": f"{os.cpu_count()} cores, {platform.machine()}",
+        "objects": asked.objects,
+        "samples": asked.samples,
+    }
     with ExitStack() as opened:
         sources = {
-            place: opened.enter_context(open_packed_maps([folder], asked.work / f"packed-{place}"))
+            place: packed(opened, folder, asked.work / f"packed-{place}", asked.objects)
             for place, folder in folders.items()
         }
-        for place, source in sources.items():
-            if len(source) != asked.objects:  # an earlier call's, which the figures would be of
-                raise SceneError(
-                    f"{folders[place]} holds {len(source)} objects, not {asked.objects}: ask for"
-                    " as many, or name an empty WORK"
-                )
-        for seed in range(asked.seeds):
-            for name in asked.sets:
-                stations = name.split("+")
-                own = recipe.model_copy(
-                    update={"seed": seed, "epochs": EPOCHS, "objects": asked.samples // EPOCHS}
-                )
-                folder = asked.work / f"{asked.objects}-{asked.samples}" / f"{name}-{seed}"
-                done = folder / "judged.json"
-                if not done.exists():
-                    network = trained(
-                        stations,
-                        [sources[each] for each in stations],
-                        own,
-                        sets[TESTS[2]],
-                        folder,
-                        compiled=asked.compile,
-                    )
-                    values = judged(network, sets, stations)
-                    done.write_text(json.dumps(values), encoding="utf-8")
-                values = json.loads(done.read_text(encoding="utf-8"))
-                runs.append({"stations": name, "seed": seed, "values": values})
-                iou = {which: float(np.mean(values[which]["silhouette_iou"])) for which in values}
-                print(
-                    name,
-                    "seed",
-                    seed,
-                    {which: round(each, 4) for which, each in iou.items()},
-                    flush=True,
-                )
-                found = summary(runs, asked.sets[0])
-                facts = {
-                    "machine": f"{os.cpu_count()} cores, {platform.machine()}",
-                    "objects": asked.objects,
-                    "samples": asked.samples,
-                    "stations": found,
-                }
-                harness.write(asked.name, facts, asked.out)
-    harness.save(asked.name, draw(found), asked.out, dpi=110)
+        runs_folder = asked.work / f"{asked.objects}-{asked.samples}"
+        material = Material(sources, sets, recipe_of(asked.samples), runs_folder, asked.compile)
+        for seed, name in product(range(asked.seeds), asked.sets):
+            values = material.values(name, seed)
+            runs.append({"stations": name, "seed": seed, "values": values})
+            iou = {
+                which: round(float(np.mean(each["silhouette_iou"])), 4)
+                for which, each in values.items()
+            }
+            print(name, "seed", seed, iou, flush=True)
+            facts["stations"] = summary(runs, asked.sets[0])
+            harness.write(asked.name, facts, asked.out)
+    harness.save(asked.name, draw(facts["stations"]), asked.out, dpi=110)
 
 
 if __name__ == "__main__":
