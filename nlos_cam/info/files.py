@@ -160,7 +160,7 @@ def _missing_points(path: Path) -> str:
     import plyfile
 
     try:
-        plyfile.PlyData.read(str(path), mmap=False)
+        plyfile.PlyData.read(str(path))
     except (plyfile.PlyParseError, ValueError):
         return f"{path} is cut short or damaged: export it again"
     return ""
