@@ -20,10 +20,10 @@ as `live` forms them, from one place (home), two (home and near) and four. Outli
 
 How far the model is trusted, the share of the covariance and the weight of the depth's prior are
 chosen by the IoU of TUNING other objects, seen from home and near, or taken from an earlier run's
-figures (`--settings`). Of the first two ways the figures
-hold the light that the estimate, its start and the truth leave unexplained ("cost", of one echo).
-Where the truth costs more than the estimate, light and model do not distinguish them; where it costs
-less, the search has not found it. WORK keeps the figures of each object: a second call goes on.
+figures (`--settings`). Of the first two ways the figures hold the light that the estimate, its start
+and the truth leave unexplained ("cost", of one echo). Where the truth costs more than the estimate,
+light and model do not distinguish them; where it costs less, the search has not found it. WORK keeps
+the figures of each object: a second call goes on.
 """
 
 import json
